@@ -1,0 +1,81 @@
+import math
+
+import pytest
+import torch
+
+from torchdyn_plan.errors import InputError
+from torchdyn_plan.planners import ReplanSchedule
+
+PAPER_STEPS = [13, 80, 140, 194, 242, 285, 323, 357, 387, 414, 439, 464, 489]
+PAPER_WINDOWS = [67, 60, 54, 48, 43, 38, 34, 30, 27, 25, 25, 25, 25]
+
+
+def run(schedule, steps, device="cpu"):
+    """Steps at which a plan was due, and the windows that began there, of one episode."""
+    clock, due_at, windows = None, [], []
+    for t in range(steps):
+        clock, due = schedule.tick(clock, torch.tensor([t], device=device))
+        if due:
+            due_at.append(t)
+            windows.append(int(clock.window))
+            assert int(clock.replans) == len(due_at)
+    return due_at, windows
+
+
+def test_the_papers_episode():
+    assert run(ReplanSchedule(), 500) == (PAPER_STEPS, PAPER_WINDOWS)
+
+
+def test_countdown_tells_the_steps_to_the_next_plan():
+    clock = None
+    for t in range(500):
+        clock, due = ReplanSchedule().tick(clock, torch.tensor([t]))
+        coming = [s for s in PAPER_STEPS if s > t]
+        if coming:
+            assert int(clock.countdown) == coming[0] - t
+        assert bool(due) == (t in PAPER_STEPS)
+
+
+def test_windows_agree_with_the_papers_integer_arithmetic_everywhere():
+    window = torch.arange(1, 100_000)
+    expected = torch.tensor([max(int(0.9 * w), 25) for w in range(1, 100_000)])
+    assert torch.equal(ReplanSchedule().next_window(window), expected)
+
+
+@pytest.mark.parametrize("hundredths", range(0, 101, 3))
+def test_any_factor_is_taken_as_the_decimal_it_is_written(hundredths):
+    window = torch.arange(1, 20_000)
+    schedule = ReplanSchedule(shrink=hundredths / 100, minimum=1)
+    assert torch.equal(schedule.next_window(window), (window * hundredths // 100).clamp_min(1))
+
+
+def test_rows_that_reset_start_afresh_and_leave_the_others_alone():
+    """Row r starts over every 50 + 30 r steps; each row behaves as if it were alone."""
+    period = torch.tensor([50, 80, 110, 500])
+    schedule, clock, got = ReplanSchedule(), None, [[] for _ in period]
+    for t in range(500):
+        clock, due = schedule.tick(clock, t % period)
+        for row in due.nonzero().flatten().tolist():
+            got[row].append(t)
+    for row, p in enumerate(period.tolist()):
+        assert got[row] == [t for t in range(500) if t % p in PAPER_STEPS]
+
+
+def test_a_clock_that_is_first_read_in_mid_episode_plans_at_once():
+    clock, due = ReplanSchedule().tick(None, torch.tensor([[5, 13], [14, 300]]))
+    assert due.tolist() == [[False, True], [True, True]]
+    assert clock.countdown.tolist() == [[8, 67], [67, 67]]
+
+
+def test_other_tasks_change_numbers_only():
+    assert run(ReplanSchedule(first_step=0, window=8, shrink=0.5, minimum=1), 12) == (
+        [0, 4, 6, 7, 8, 9, 10, 11], [4, 2, 1, 1, 1, 1, 1, 1],
+    )  # fmt: skip
+
+
+@pytest.mark.parametrize(
+    "bad", [{"first_step": -1}, {"window": 0}, {"window": 7.5}, {"shrink": 1.5}, {"shrink": math.nan}, {"minimum": 0}]
+)
+def test_bad_numbers_are_named(bad):
+    with pytest.raises(InputError, match=f"{next(iter(bad))}.*{next(iter(bad.values()))}"):
+        ReplanSchedule(**bad)

@@ -1,0 +1,232 @@
+"""What each command takes. Light on purpose: nothing heavy is imported until an argument is checked."""
+
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Literal
+
+from torchdyn_plan.errors import InputError, UsageError
+
+PLANNERS = ("pursuit", "corner", "oracle")
+"""Names of the planners for a moving target."""
+
+STATICS = ("ik",)
+"""Names of the static planners."""
+
+SPLITS = ("test", "dev")
+"""Series of episodes to evaluate on: tuning sees ``dev`` only."""
+
+BENCHMARKS = {"replan": "torchdyn_plan.evaluation.bench_replan", "env": "torchdyn_plan.evaluation.bench_env"}
+"""Name of each benchmark, and the module whose ``bench()`` returns its rows."""
+
+
+@contextmanager
+def _as_usage_error() -> Iterator[None]:
+    """Let a failed check surface as the error of a command, which no parser takes for a value it cannot convert."""
+    try:
+        yield
+    except InputError as error:
+        raise UsageError(str(error)) from error
+
+
+def _check_names(planners: tuple[str, ...], static: str, split: str) -> None:
+    from torchdyn_plan.checks import check_choice
+
+    if not planners:
+        raise InputError(f"planners must name at least one of {', '.join(PLANNERS)}")
+    for planner in planners:
+        check_choice("planner", planner, PLANNERS)
+    if len(set(planners)) < len(planners):
+        raise InputError(f"planners must be named once each, got {' '.join(planners)}")
+    check_choice("static planner", static, STATICS)
+    check_choice("split", split, SPLITS)
+
+
+def _check_counts(**counts: tuple[int | None, int]) -> None:
+    """Check integers given as ``name=(value, minimum)``; None stands for a default."""
+    from torchdyn_plan.checks import check_number
+
+    for name, (value, minimum) in counts.items():
+        if value is not None:
+            check_number(name, value, minimum=minimum, integer=True)
+
+
+def _check_ball(velocity: float, friction: float) -> None:
+    from torchdyn_plan.checks import check_number
+
+    check_number("velocity", velocity, minimum=0.0, maximum=20.0)
+    check_number("friction", friction, minimum=0.0)
+
+
+@dataclass(frozen=True, kw_only=True)
+class EvaluateArguments:
+    """Run episodes at one velocity and friction with each planner; print a table and write the results."""
+
+    planners: tuple[str, ...] = PLANNERS
+    """Planners for the moving target: pursuit, corner, oracle."""
+    static: str = "ik"
+    """Static planner that drives the arm: ik."""
+    velocity: float = 3.0
+    """Velocity of the ball at the start [m/s]."""
+    friction: float = 0.0
+    """Friction loss of the ball [N]."""
+    episodes: int = 100
+    """Number of episodes for each planner, always episodes 0 to N-1."""
+    seed: int = 0
+    """Which series of episodes."""
+    split: str = "test"
+    """Which family of series: test, or dev for tuning."""
+    num_envs: int = 64
+    """Episodes that run side by side; does not change the results."""
+    threads: int = 0
+    """Threads of the simulation, 0 for all cores; does not change the results."""
+    out: Path | None = None
+    """Folder for results.json, episodes.json and the plot; nothing is written without it."""
+
+    def __post_init__(self) -> None:
+        with _as_usage_error():
+            _check_names(self.planners, self.static, self.split)
+            _check_ball(self.velocity, self.friction)
+            _check_counts(
+                episodes=(self.episodes, 1), seed=(self.seed, 0), num_envs=(self.num_envs, 1), threads=(self.threads, 0)
+            )
+
+
+@dataclass(frozen=True, kw_only=True)
+class SweepArguments:
+    """Evaluate along a range of velocities or frictions, as the paper's Figure 4; a killed sweep continues."""
+
+    over: Literal["velocity", "friction"]
+    """What varies."""
+    out: Path
+    """Folder of the sweep: its points, results.json and the plot. One that holds points already is continued."""
+    values: tuple[float, ...] = ()
+    """Velocities [m/s] or friction losses [N]; the paper's when none are given."""
+    planners: tuple[str, ...] = PLANNERS
+    """Planners for the moving target: pursuit, corner, oracle."""
+    static: str = "ik"
+    """Static planner that drives the arm: ik."""
+    velocity: float = 3.0
+    """Velocity of the ball when friction varies [m/s]."""
+    friction: float = 0.0
+    """Friction loss of the ball when velocity varies [N]."""
+    episodes: int = 100
+    """Number of episodes for each planner, value and repeat."""
+    repeats: int = 10
+    """Series of episodes for each value, with seeds upwards from the first."""
+    seed: int = 0
+    """Seed of the first series."""
+    split: str = "test"
+    """Which family of series: test, or dev for tuning."""
+    num_envs: int = 64
+    """Episodes that run side by side; does not change the results."""
+    threads: int = 0
+    """Threads of the simulation, 0 for all cores; does not change the results."""
+
+    def __post_init__(self) -> None:
+        with _as_usage_error():
+            if self.over not in ("velocity", "friction"):
+                raise InputError(f"over must be velocity or friction, got {self.over!r}")
+            if len(set(self.values)) < len(self.values):
+                raise InputError(f"values must differ, got {' '.join(map(str, self.values))}")
+            _check_counts(repeats=(self.repeats, 1))
+        for value in (*self.values, None):
+            self.point(value, 0)
+
+    def point(self, value: float | None, repeat: int) -> EvaluateArguments:
+        """The evaluation at one value (None: the fixed ones) and repeat, with nothing written."""
+        return EvaluateArguments(
+            planners=self.planners,
+            static=self.static,
+            velocity=value if value is not None and self.over == "velocity" else self.velocity,
+            friction=value if value is not None and self.over == "friction" else self.friction,
+            episodes=self.episodes,
+            seed=self.seed + repeat,
+            split=self.split,
+            num_envs=self.num_envs,
+            threads=self.threads,
+        )
+
+
+@dataclass(frozen=True, kw_only=True)
+class CollectArguments:
+    """Gather training data: paths of the rolling ball, or arrival times of a static planner."""
+
+    what: Literal["paths", "arrivals"]
+    """Paths of the ball for the forecaster, or arrivals of the arm for the arrival-time network."""
+    out: Path = Path("runs/data")
+    """Folder for the shards of data."""
+    static: str = "ik"
+    """Static planner whose arrivals are measured: ik."""
+    episodes: int = 20000
+    """Number of balls rolled, or of runs of the static planner."""
+    seed: int = 0
+    """Which series of episodes."""
+    num_envs: int = 256
+    """Episodes that run side by side."""
+    threads: int = 0
+    """Threads of the simulation, 0 for all cores."""
+
+    def __post_init__(self) -> None:
+        from torchdyn_plan.checks import check_choice
+
+        with _as_usage_error():
+            check_choice("static planner", self.static, STATICS)
+            _check_counts(
+                episodes=(self.episodes, 1), seed=(self.seed, 0), num_envs=(self.num_envs, 1), threads=(self.threads, 0)
+            )
+
+
+@dataclass(frozen=True, kw_only=True)
+class TrainArguments:
+    """Fit a network to collected data; a killed run continues where its folder stands."""
+
+    what: Literal["forecaster", "eta"]
+    """Which network: forecaster (paths of the ball) or eta (arrival times of the arm)."""
+    data: Path = Path("runs/data")
+    """Folder of the collected shards."""
+    out: Path = Path("runs/training")
+    """Folder for checkpoints, the curve and the weights, one for each network."""
+    steps: int | None = None
+    """Optimiser steps; the recipe's own when not given."""
+    batch: int | None = None
+    """Samples a step; the recipe's own when not given."""
+    lr: float | None = None
+    """Highest learning rate; the recipe's own when not given."""
+    seed: int = 0
+    """Seed of initialisation and sampling."""
+    device: str = "cpu"
+    """Where to train: cpu, cuda, cuda:1, …"""
+    resume: bool = True
+    """Continue from the checkpoint in the folder, if there is one."""
+
+    def __post_init__(self) -> None:
+        from torchdyn_plan.checks import check_number
+
+        with _as_usage_error():
+            _check_counts(steps=(self.steps, 1), batch=(self.batch, 1), seed=(self.seed, 0))
+            if self.lr is not None:
+                check_number("lr", self.lr, minimum=1e-9)
+
+    def settings(self) -> dict[str, int | float | str | bool]:
+        """Keyword arguments of the fit: those that were given, and the rest that always are."""
+        given = {"steps": self.steps, "batch": self.batch, "lr": self.lr}
+        always = {"seed": self.seed, "device": self.device, "resume": self.resume}
+        return always | {name: value for name, value in given.items() if value is not None}
+
+
+@dataclass(frozen=True, kw_only=True)
+class BenchArguments:
+    """Measure speed on this machine."""
+
+    name: str
+    """What to measure: replan (latency of a re-plan) or env (rate of the simulation)."""
+    out: Path | None = None
+    """JSON file for the figures."""
+
+    def __post_init__(self) -> None:
+        from torchdyn_plan.checks import check_choice
+
+        with _as_usage_error():
+            check_choice("benchmark", self.name, BENCHMARKS)

@@ -1,0 +1,1 @@
+"""Episodes, solvability, sweeps, tables and plots."""

@@ -1,0 +1,58 @@
+"""The tensordict keys that environments, planners and training share, in one table."""
+
+from dataclasses import dataclass
+
+JOINT_POS = "joint_pos"
+JOINT_VEL = "joint_vel"
+TOOL_POS = "tool_pos"
+TARGET_POS = "target_pos"
+TARGET_HISTORY = "target_history"
+HISTORY_LENGTH = "history_length"
+TARGET_FUTURE = "target_future"
+ROBOT_STATE = "robot_state"
+OBSERVATION = "observation"
+ACHIEVED_GOAL = "achieved_goal"
+DESIRED_GOAL = "desired_goal"
+STEP_COUNT = "step_count"
+GOAL = "goal"
+ARRIVAL_STEPS = "arrival_steps"
+ACTION = "action"
+TRAPPED = "trapped"
+POCKETED = "pocketed"
+EPISODE = "episode"
+PLAN = "plan"
+
+
+@dataclass(frozen=True, kw_only=True)
+class Key:
+    """What one tensordict entry holds: its trailing shape in symbols, its unit and frame, and its writer."""
+
+    name: str
+    shape: tuple[str | int, ...]
+    """Trailing shape after the batch: N joints, A action size, H history, F horizon, S robot state size."""
+    meaning: str
+    writer: str
+
+
+KEYS: tuple[Key, ...] = (
+    Key(name=JOINT_POS, shape=("N",), meaning="joint angles [rad]", writer="env"),
+    Key(name=JOINT_VEL, shape=("N",), meaning="joint speeds [rad/s]", writer="env"),
+    Key(name=TOOL_POS, shape=(3,), meaning="centre of the box mouth [m, world]", writer="env"),
+    Key(name=TARGET_POS, shape=(3,), meaning="centre of the target [m, world]", writer="env"),
+    Key(name=TARGET_HISTORY, shape=("H", 3), meaning="target positions, oldest first [m, world]", writer="env"),
+    Key(name=HISTORY_LENGTH, shape=(), meaning="samples in the history that are no padding", writer="env"),
+    Key(name=ROBOT_STATE, shape=("S",), meaning="what a policy or an ETA network reads", writer="env"),
+    Key(name=OBSERVATION, shape=("S",), meaning="robot state under TorchRL's name", writer="env"),
+    Key(name=ACHIEVED_GOAL, shape=(3,), meaning="tool position under Gymnasium's name [m, world]", writer="env"),
+    Key(name=DESIRED_GOAL, shape=(3,), meaning="place to reach [m, world]", writer="env"),
+    Key(name=STEP_COUNT, shape=(), meaning="control steps since the reset", writer="env"),
+    Key(name=TRAPPED, shape=(1,), meaning="the target is covered and kept", writer="env"),
+    Key(name=POCKETED, shape=(1,), meaning="the target fell into a pocket", writer="env"),
+    Key(name=EPISODE, shape=(), meaning="index of the episode within its split and seed", writer="env"),
+    Key(name=GOAL, shape=(3,), meaning="place the static planner is sent to [m, world]", writer="planner"),
+    Key(name=ARRIVAL_STEPS, shape=(), meaning="control steps from now to the meeting", writer="planner"),
+    Key(name=ACTION, shape=("A",), meaning="joint speed as a fraction of the limit, -1 to 1", writer="static planner"),
+    Key(name=TARGET_FUTURE, shape=("F", 3), meaning="recorded truth, for the oracle alone [m, world]", writer="evaluation"),
+    Key(name=PLAN, shape=(), meaning="the planner's memory between steps (nested)", writer="planner"),
+)
+"""Every shared key. Further entries below ``plan`` belong to the planner that wrote them."""

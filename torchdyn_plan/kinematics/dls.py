@@ -1,0 +1,50 @@
+"""Damped least squares for a tool that points straight down and stands square to the world's axes."""
+
+import math
+
+import torch
+from torch import Tensor
+
+QUARTER_TURN = math.pi / 2
+
+
+def dls_step(jacobian: Tensor, error: Tensor, damping: float) -> Tensor:
+    """Joint step of damped least squares, Δq = Jᵀ(JJᵀ + λ²I)⁻¹e (Wampler 1986; Nakamura & Hanafusa 1986).
+
+    Args:
+        jacobian: ``(*B, 6, N)``, rows [v; ω].
+        error: ``(*B, 6)``, the twist still to go [m; rad].
+        damping: λ > 0; at a singular configuration it bounds the step by ``|e| / 2λ``.
+
+    Returns:
+        ``(*B, N)`` [rad].
+    """
+    # Dividing rows and columns by λ keeps float32 well-conditioned: (JJᵀ/λ² + I).
+    scaled = jacobian / damping
+    gram = scaled @ scaled.mT
+    gram.diagonal(dim1=-2, dim2=-1).add_(1.0)
+    factor, _ = torch.linalg.cholesky_ex(gram)
+    weights = torch.cholesky_solve(error.unsqueeze(-1) / damping, factor)
+    return (scaled.mT @ weights).squeeze(-1)
+
+
+def upright_error(rotation: Tensor) -> Tensor:
+    """Rotation vector that turns a tool's z axis straight down and its x axis to the nearest world axis.
+
+    A square box is the same after a quarter turn about z, so the yaw error is taken modulo π/2.
+
+    Args:
+        rotation: ``(*B, 3, 3)``, columns are the tool's axes in the base frame.
+
+    Returns:
+        ``(*B, 3)`` [rad], base frame: tilt by the small-angle cross product z_tool × (-z), yaw exactly.
+    """
+    yaw = torch.atan2(rotation[..., 1, 0], rotation[..., 0, 0])
+    turn = torch.round(yaw / QUARTER_TURN) * QUARTER_TURN - yaw
+    return torch.stack([-rotation[..., 1, 2], rotation[..., 0, 2], turn], dim=-1)
+
+
+def limited_step(step: Tensor, limit: Tensor, gain: float) -> Tensor:
+    """Shorten ``step`` (*B, N) to ``gain`` of itself, and further so that no joint moves more than ``limit`` (N,)."""
+    worst = (step.abs() / limit).amax(dim=-1, keepdim=True)
+    return step * torch.clamp(1.0 / worst.clamp_min(1e-12), max=gain)

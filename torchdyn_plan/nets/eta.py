@@ -1,0 +1,185 @@
+"""When the robot can be somewhere: a classifier of arrival times, as a static planner would drive it there."""
+
+from dataclasses import dataclass
+from typing import Any, NamedTuple
+
+import torch
+from torch import Tensor, nn
+
+from torchdyn_plan.checks import check_choice, check_finite, check_number, check_same_device, check_trailing_shape
+from torchdyn_plan.errors import InputError
+from torchdyn_plan.nets.pretrained import Pretrained
+
+
+class Arrival(NamedTuple):
+    """When, and whether, the robot arrives."""
+
+    steps: Tensor
+    """``(*B,)`` control steps from now, in the network's dtype; counts only where ``never`` is False."""
+    never: Tensor
+    """``(*B,)`` bool: the goal is not reached within the bins."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class ETAConfig:
+    """Sizes of an `ETANetwork`; the defaults are the paper's for a UR5."""
+
+    robot_state_size: int = 15
+    """Size S of the robot state."""
+    tool_slice: tuple[int, int] = (12, 15)
+    """First and one-past-last entry of the robot state that hold the tool position."""
+    bins: int = 100
+    """Bins of arrival time; one more class means *never arrives*."""
+    bin_width: int = 5
+    """Control steps in a bin."""
+    hidden: int = 256
+    """Width of the three hidden layers."""
+
+    def __post_init__(self) -> None:
+        for name in ("robot_state_size", "bins", "bin_width", "hidden"):
+            check_number(name, getattr(self, name), minimum=1, integer=True)
+        object.__setattr__(self, "tool_slice", tuple(self.tool_slice))
+        first, last = self.tool_slice
+        if not 0 <= first < last <= self.robot_state_size or last - first != 3:
+            raise InputError(f"tool_slice must span 3 entries of a robot state of {self.robot_state_size}, got {self.tool_slice}")
+
+
+class ETANetwork(Pretrained, nn.Module):
+    """Estimated time of arrival P_ETA^R (paper, Section III-B3): robot state and goal to a distribution over time.
+
+    Three hidden linear + ReLU layers and a linear one. Features of the state enter the first layer separately from
+    those of the goal (its place, its offset and distance from the tool), so many goals share one state's work.
+    Inputs are standardised by buffers that `set_input_statistics` fills from training data.
+    """
+
+    kind = "eta"
+    config_type = ETAConfig
+    state_offset: Tensor
+    state_scale: Tensor
+    goal_offset: Tensor
+    goal_scale: Tensor
+
+    def __init__(self, config: ETAConfig | None = None, **settings: Any) -> None:
+        """Build the network from ``config``, or from the fields of `ETAConfig` given as keywords."""
+        super().__init__()
+        self.config = config = config or ETAConfig(**settings)
+        size, hidden = config.robot_state_size, config.hidden
+        self.state_in = nn.Linear(size, hidden)
+        self.goal_in = nn.Linear(8, hidden, bias=False)
+        self.second = nn.Linear(hidden, hidden)
+        self.third = nn.Linear(hidden, hidden)
+        self.head = nn.Linear(hidden, config.bins + 1)
+        for name, width in (("state", size), ("goal", 8)):
+            self.register_buffer(f"{name}_offset", torch.zeros(width))
+            self.register_buffer(f"{name}_scale", torch.ones(width))
+
+    @torch.no_grad()
+    def set_input_statistics(self, robot_state: Tensor, goal: Tensor) -> None:
+        """Standardise inputs by mean and deviation of the samples ``robot_state (n, S)`` and ``goal (n, 3)``."""
+        features = self._goal_features(robot_state, goal)
+        for name, values in (("state", robot_state), ("goal", features)):
+            getattr(self, f"{name}_offset").copy_(values.mean(dim=0))
+            getattr(self, f"{name}_scale").copy_(1.0 / values.std(dim=0).clamp(min=1e-3))
+
+    def forward(self, robot_state: Tensor, goal: Tensor) -> Tensor:
+        """Scores of the bins; the last one stands for *never arrives*.
+
+        Args:
+            robot_state: ``(*B, S)``; its batch broadcasts against the goal's, ``(*B, 1, S)`` with ``(*B, K, 3)``
+                serves K goals from one state.
+            goal: ``(*B, 3)`` places to reach [m, world].
+
+        Returns:
+            ``(*B, bins + 1)`` logits.
+
+        Raises:
+            InputError: a trailing shape or a device is wrong, or an input holds a NaN.
+        """
+        if not torch.compiler.is_compiling():
+            self._check(robot_state, goal)
+        state = (robot_state - self.state_offset) * self.state_scale
+        target = (self._goal_features(robot_state, goal) - self.goal_offset) * self.goal_scale
+        hidden = torch.relu(self.state_in(state) + self.goal_in(target))
+        hidden = torch.relu(self.second(hidden))
+        return self.head(torch.relu(self.third(hidden)))
+
+    def arrival(self, robot_state: Tensor, goal: Tensor, *, reading: str = "mode") -> Arrival:
+        """Arrival time at ``goal (*B, 3)`` from ``robot_state (*B, S)``, batches broadcasting as in `forward`.
+
+        Args:
+            robot_state: as in `forward`.
+            goal: as in `forward`.
+            reading: ``mode``, the paper's, or ``expectation``, which is finer than a bin.
+        """
+        check_choice("reading", reading, READINGS)
+        return READINGS[reading](self(robot_state, goal), bin_width=self.config.bin_width)
+
+    def _goal_features(self, robot_state: Tensor, goal: Tensor) -> Tensor:
+        """Goal, its offset from the tool, level and full distance: ``(*B, 8)``."""
+        first, last = self.config.tool_slice
+        offset = goal - robot_state[..., first:last]
+        square = offset.square()
+        level = square[..., :2].sum(dim=-1, keepdim=True)
+        # The square root's slope is infinite at zero distance.
+        distance = (torch.cat([level, level + square[..., 2:]], dim=-1) + 1e-8).sqrt()
+        return torch.cat([goal.expand(offset.shape), offset, distance], dim=-1)
+
+    def _check(self, robot_state: Tensor, goal: Tensor) -> None:
+        device = self.head.weight.device
+        for name, tensor, size in (("robot_state", robot_state, self.config.robot_state_size), ("goal", goal, 3)):
+            check_trailing_shape(name, tensor, size)
+            check_same_device(name, tensor, device, type(self).__name__)
+            check_finite(name, tensor)
+
+
+def decode_mode(logits: Tensor, *, bin_width: int = 5) -> Arrival:
+    """Middle of the likeliest bin, as in the paper: bin k is ``bin_width·k + (bin_width - 1)/2``, rounded down.
+
+    Args:
+        logits: ``(*B, bins + 1)``, the last for *never arrives*.
+        bin_width: control steps in a bin.
+
+    Returns:
+        `Arrival` of ``(*B,)``; ``never`` where the last class is the likeliest.
+    """
+    bins = logits.shape[-1] - 1
+    never = logits.argmax(dim=-1) == bins
+    steps = bin_width * logits[..., :bins].argmax(dim=-1) + (bin_width - 1) // 2
+    return Arrival(steps.to(logits.dtype), never)
+
+
+def decode_expectation(logits: Tensor, *, bin_width: int = 5) -> Arrival:
+    """Mean arrival time given that the robot arrives: differentiable, and finer than a bin.
+
+    Args:
+        logits: ``(*B, bins + 1)``, the last for *never arrives*.
+        bin_width: control steps in a bin.
+
+    Returns:
+        `Arrival` of ``(*B,)``; ``never`` where *never* is likelier than all bins together.
+    """
+    bins = logits.shape[-1] - 1
+    share = logits.softmax(dim=-1)
+    middle = bin_width * torch.arange(bins, device=logits.device, dtype=logits.dtype) + (bin_width - 1) / 2
+    arrives = logits[..., :bins].softmax(dim=-1)
+    return Arrival((arrives * middle).sum(dim=-1), share[..., bins] > 0.5)
+
+
+READINGS = {"mode": decode_mode, "expectation": decode_expectation}
+"""How a distribution over bins becomes one arrival time."""
+
+
+def arrival_classes(arrival: Tensor, *, bins: int = 100, bin_width: int = 5) -> tuple[Tensor, Tensor]:
+    """Target distribution for cross-entropy: an arrival time between two bins' middles is shared by the two.
+
+    With it the expectation is unbiased below a bin's width, and the likeliest bin is still the one that holds the time.
+
+    Args:
+        arrival: ``(n,)`` int64 control steps, negative or beyond the bins for *never*.
+        bins: number of bins.
+        bin_width: control steps in a bin.
+
+    Returns:
+        Probabilities ``(n, bins + 1)`` float32, and the class ``(n,)`` int64 that holds the time.
+    """
+    raise NotImplementedError

@@ -1,0 +1,137 @@
+"""Where the target will be: a convolutional network that emits the whole horizon at once, without recurrence."""
+
+from dataclasses import dataclass
+from typing import Any
+
+import torch
+from torch import Tensor, nn
+
+from torchdyn_plan.checks import check_finite, check_number, check_same_device, check_trailing_shape
+from torchdyn_plan.errors import InputError
+from torchdyn_plan.nets.cushions import fold
+from torchdyn_plan.nets.pretrained import Pretrained
+from torchdyn_plan.nets.symmetry import octant, square_symmetries
+
+
+@dataclass(frozen=True, kw_only=True)
+class ForecasterConfig:
+    """Sizes of a `Forecaster` and what it knows about the space that the target moves in."""
+
+    history: int = 24
+    """Positions H that it sees, the newest included."""
+    horizon: int = 300
+    """Positions F that it emits."""
+    channels: int = 32
+    """Features of a step after embedding and after each convolution."""
+    convolutions: int = 3
+    """Convolutions over the history, each of stride 2."""
+    hidden: int = 512
+    """Width of the two layers between convolutions and head."""
+    step_scale: float = 0.02
+    """Length of a step that counts as one [m]: fast motion over one control step."""
+    length_scale: float = 0.75
+    """Distance from the origin that counts as one [m]."""
+    height_scale: float = 0.05
+    """Height that counts as one [m]."""
+    half_extent: float | None = None
+    """Where the target's centre turns back at a square table's cushions, |x| or |y| [m]; None where space is open."""
+    square_symmetry: bool = False
+    """Whether mirrored or turned histories (about z, by quarters) have exactly mirrored or turned forecasts."""
+
+    def __post_init__(self) -> None:
+        check_number("history", self.history, minimum=2, integer=True)
+        for name in ("horizon", "channels", "convolutions", "hidden"):
+            check_number(name, getattr(self, name), minimum=1, integer=True)
+        for name in ("step_scale", "length_scale", "height_scale"):
+            check_number(name, getattr(self, name), minimum=1e-9)
+        if self.half_extent is not None:
+            check_number("half_extent", self.half_extent, minimum=1e-9)
+        if not isinstance(self.square_symmetry, bool):
+            raise InputError(f"square_symmetry must be a bool, got {self.square_symmetry!r}")
+
+
+class Forecaster(Pretrained, nn.Module):
+    """Trajectory forecasting network P_traj^O (paper, eq. 2), after the convolutional one of Nikhil & Morris (2018).
+
+    Relative displacements are embedded step by step, convolved over the history, joined with the newest position and
+    step, and turned by one linear head into all F positions, as departures from constant velocity. On a table with
+    cushions it forecasts the unfolded line (`torchdyn_plan.nets.cushions`) and folds it back.
+    """
+
+    kind = "forecaster"
+    config_type = ForecasterConfig
+    symmetries: Tensor
+    steps_ahead: Tensor
+
+    def __init__(self, config: ForecasterConfig | None = None, **settings: Any) -> None:
+        """Build the network from ``config``, or from the fields of `ForecasterConfig` given as keywords."""
+        super().__init__()
+        self.config = config = config or ForecasterConfig(**settings)
+        channels, length = config.channels, config.history - 1
+        self.embed = nn.Conv1d(4, channels, 1)
+        self.convolve = nn.ModuleList(
+            nn.Conv1d(channels, channels, 3, stride=2, padding=1) for _ in range(config.convolutions)
+        )
+        for _ in range(config.convolutions):
+            length = (length + 1) // 2
+        self.join = nn.Linear(channels * length + 6, config.hidden)
+        self.hidden = nn.Linear(config.hidden, config.hidden)
+        self.head = nn.Linear(config.hidden, 3 * config.horizon)
+        nn.init.zeros_(self.head.bias)
+        self.head.weight.data.mul_(0.1)
+        self.register_buffer("symmetries", square_symmetries(), persistent=False)
+        steps = torch.arange(1.0, config.horizon + 1.0).unsqueeze(-1)
+        self.register_buffer("steps_ahead", steps, persistent=False)
+
+    def forward(self, target_history: Tensor) -> Tensor:
+        """Positions at the next F control steps.
+
+        Args:
+            target_history: ``(*B, H, 3)`` positions, oldest first; rows before the first sample repeat it [m, world].
+
+        Returns:
+            ``(*B, F, 3)``: entry e-1 is the position in e steps [m, world].
+
+        Raises:
+            InputError: the history has another shape, another device than the network, or holds a NaN.
+        """
+        if not torch.compiler.is_compiling():
+            self._check(target_history)
+        line = self.unfolded(target_history)
+        if self.config.half_extent is None:
+            return line
+        return torch.cat([fold(line[..., :2], self.config.half_extent), line[..., 2:]], dim=-1)
+
+    def unfolded(self, target_history: Tensor) -> Tensor:
+        """Same as `forward` before cushions mirror the line: what training compares, ``(*B, F, 3)`` [m, world]."""
+        config = self.config
+        now = target_history[..., -1:, :]
+        step = target_history.diff(dim=-2)
+        if not config.square_symmetry:
+            return now + self._departure(now, step)
+        # A pinch of position decides for a target that moves along an axis or lies still.
+        direction = step[..., -1, :2] + 1e-6 * now[..., 0, :2]
+        turn = self.symmetries[octant(direction)]
+        return now + self._departure(now @ turn, step @ turn) @ turn.mT
+
+    def _departure(self, now: Tensor, step: Tensor) -> Tensor:
+        """Displacements ``(*B, F, 3)`` from the newest position ``(*B, 1, 3)`` after the steps ``(*B, H-1, 3)`` [m]."""
+        config, batch = self.config, step.shape[:-2]
+        real = (step != 0).any(dim=-1, keepdim=True).to(step.dtype)
+        features = torch.cat([step / config.step_scale, real], dim=-1).flatten(0, -3) if batch else torch.cat(
+            [step / config.step_scale, real], dim=-1
+        ).unsqueeze(0)
+        features = torch.relu(self.embed(features.mT))
+        for layer in self.convolve:
+            features = torch.relu(layer(features))
+        newest = torch.cat([now.flatten(-2) / config.length_scale, step[..., -1, :] / config.step_scale], dim=-1)
+        joined = torch.cat([features.reshape(*batch, -1), newest], dim=-1)
+        hidden = torch.relu(self.hidden(torch.relu(self.join(joined))))
+        out = self.head(hidden).unflatten(-1, (config.horizon, 3))
+        level = self.steps_ahead * (step[..., -1:, :2] + config.step_scale * out[..., :2])
+        return torch.cat([level, config.height_scale * out[..., 2:]], dim=-1)
+
+    def _check(self, target_history: Tensor) -> None:
+        check_trailing_shape("target_history", target_history, self.config.history, 3)
+        check_same_device("target_history", target_history, self.head.weight.device, type(self).__name__)
+        check_finite("target_history", target_history)

@@ -1,0 +1,26 @@
+"""The eight symmetries of a square table, as rotation-reflection matrices that bring any motion into one octant."""
+
+import torch
+from torch import Tensor
+
+
+def square_symmetries() -> Tensor:
+    """The group D4 acting on x and y, ``(8, 3, 3)`` float32; entry 4·swap + 2·(y < 0) + (x < 0) of `octant`."""
+    swap = torch.tensor([[0.0, 1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]])
+    flips = [torch.diag(torch.tensor([x, y, 1.0])) for y in (1.0, -1.0) for x in (1.0, -1.0)]
+    return torch.stack(flips + [flip @ swap for flip in flips])
+
+
+def octant(direction: Tensor) -> Tensor:
+    """Which of the eight symmetries brings ``direction`` into the octant x ≥ y ≥ 0.
+
+    Args:
+        direction: ``(*B, 2)``; rows are multiplied by the symmetry from the right: ``direction @ symmetry``.
+
+    Returns:
+        ``(*B,)`` int64 index into `square_symmetries`.
+    """
+    negative = direction < 0
+    size = direction.abs()
+    swap = size[..., 1] > size[..., 0]
+    return negative[..., 0] + 2 * negative[..., 1] + 4 * swap

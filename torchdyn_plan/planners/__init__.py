@@ -1,0 +1,22 @@
+"""Planners: for a static goal, for a moving target, and the baselines; each takes and returns a tensordict."""
+
+from torchdyn_plan.planners.baselines import OracleTrajectory, TargetPursuit
+from torchdyn_plan.planners.callable import CallablePlanner
+from torchdyn_plan.planners.dynamic import DynamicPlanner
+from torchdyn_plan.planners.ik import IKPlanner
+from torchdyn_plan.planners.protocol import StaticPlanner
+from torchdyn_plan.planners.schedule import ReplanSchedule
+from torchdyn_plan.planners.search import CornerSearch, SearchResult, search_corners
+
+__all__ = [
+    "CallablePlanner",
+    "CornerSearch",
+    "DynamicPlanner",
+    "IKPlanner",
+    "OracleTrajectory",
+    "ReplanSchedule",
+    "SearchResult",
+    "StaticPlanner",
+    "TargetPursuit",
+    "search_corners",
+]

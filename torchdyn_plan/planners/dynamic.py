@@ -1,0 +1,120 @@
+"""The idea of this package: a planner for a static target, made to meet a moving one."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from functools import partial
+
+import torch
+from tensordict import TensorDictBase
+from tensordict.nn import TensorDictModuleBase
+from torch import Tensor
+
+from torchdyn_plan import keys
+from torchdyn_plan.checks import check_choice, check_finite, check_number, check_same_device, check_trailing_shape
+from torchdyn_plan.planners.ik import IKPlanner
+from torchdyn_plan.planners.memory import MEMORY_KEYS, carry_on, recall, remember
+from torchdyn_plan.planners.protocol import ArrivalPredictor, GoalSearch, StaticPlanner, keys_read, keys_written, read
+from torchdyn_plan.planners.rows import apply_to_rows
+from torchdyn_plan.planners.schedule import ReplanSchedule
+from torchdyn_plan.planners.search import CornerSearch, SearchResult
+
+PRETRAINED = {"trapper-ik": (IKPlanner, "trapper", "trapper-ik")}
+"""Name → class of the static planner, name of the forecaster's weights, name of the ETA network's weights."""
+
+
+class DynamicPlanner(TensorDictModuleBase):
+    """Meets a moving target: history → forecast → goal search → ``goal``, ``arrival_steps`` → static planner → action.
+
+    Rows plan anew when their schedule says so and keep their goal in between; before its first plan a row stays where
+    its tool is. A tensordict goes in, of any batch size, and the same one comes out, with `goal` (*B, 3) [m, world],
+    `arrival_steps` (*B,), whatever the static planner writes, and the memory for the next step under ``plan``. Rows
+    with ``step_count`` 0 start afresh, so that one planner serves environments that reset at different moments.
+    """
+
+    def __init__(
+        self,
+        static: StaticPlanner,
+        forecaster: Callable[..., Tensor],
+        eta: ArrivalPredictor,
+        *,
+        search: GoalSearch | None = None,
+        schedule: ReplanSchedule | None = None,
+        chunk: int | None = None,
+    ) -> None:
+        """Join the parts.
+
+        Args:
+            static: planner for a static goal.
+            forecaster: maps what it reads, ``target_history`` (*B, H, 3) or its own ``in_keys``, to the target's
+                positions in the next F control steps, ``(*B, F, 3)`` [m, world].
+            eta: tells how long ``static`` needs to a goal.
+            search: chooses the goal on the forecast; the paper's corner search by default.
+            schedule: when to plan anew; the paper's by default.
+            chunk: plan in blocks of exactly this many rows, so that results do not depend on the batch size.
+        """
+        super().__init__()
+        if chunk is not None:
+            check_number("chunk", chunk, minimum=1, integer=True)
+        self.static, self.forecaster, self.eta = static, forecaster, eta
+        self.search, self.schedule, self.chunk = search or CornerSearch(), schedule or ReplanSchedule(), chunk
+        self.seen_keys = tuple(getattr(forecaster, "in_keys", (keys.TARGET_HISTORY,)))
+        state = (keys.ROBOT_STATE, keys.TARGET_POS, keys.TOOL_POS, keys.STEP_COUNT)
+        self.in_keys = keys_read(static, *state, *self.seen_keys)
+        self.out_keys = keys_written(static, keys.GOAL, keys.ARRIVAL_STEPS, *MEMORY_KEYS)
+
+    def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
+        """Plan where a plan is due, and act.
+
+        Raises:
+            InputError: a key is missing, a shape is wrong, the history holds a NaN, or data and networks are on
+                different devices.
+        """
+        get = partial(read, tensordict, reader="DynamicPlanner")
+        tool_pos, target_pos, robot_state = get(keys.TOOL_POS), get(keys.TARGET_POS), get(keys.ROBOT_STATE)
+        seen = [get(key) for key in self.seen_keys]
+        if not torch.compiler.is_compiling():
+            self._check(tool_pos, target_pos, dict(zip(self.seen_keys, seen, strict=True)))
+        step_count = get(keys.STEP_COUNT).reshape(tool_pos.shape[:-1])
+
+        memory = recall(tensordict)
+        clock, due = self.schedule.tick(None if memory is None else memory.clock, step_count)
+        meeting = carry_on(memory, tool_pos, step_count)
+        planned = apply_to_rows(self.plan, due, (robot_state, target_pos, *seen), meeting, chunk=self.chunk)
+        remember(tensordict, clock, SearchResult(*planned), replanned=due)
+        return self.static(tensordict)
+
+    def plan(self, robot_state: Tensor, target_pos: Tensor, *seen: Tensor) -> SearchResult:
+        """Forecast and choose a meeting, for robot states (*B, S), targets (*B, 3) and what the forecaster reads."""
+        forecast = self.forecaster(*seen)
+        eta = partial(self.eta.arrival, robot_state.unsqueeze(-2))
+        return self.search(forecast, target_pos, eta)
+
+    def _check(self, tool_pos: Tensor, target_pos: Tensor, seen: dict[str, Tensor]) -> None:
+        check_trailing_shape(keys.TOOL_POS, tool_pos, 3)
+        check_trailing_shape(keys.TARGET_POS, target_pos, 3)
+        parameter = next(self.parameters(), None)
+        if parameter is not None:
+            check_same_device(keys.TARGET_POS, target_pos, parameter.device, "the planner")
+        history = seen.get(keys.TARGET_HISTORY)
+        if history is not None:
+            length = getattr(getattr(self.forecaster, "config", None), "history", history.shape[-2])
+            check_trailing_shape(keys.TARGET_HISTORY, history, length, 3)
+            # The sum is a quick look: only a sum that is not finite is worth the full one.
+            if not torch.isfinite(history.sum()):
+                check_finite(keys.TARGET_HISTORY, history)
+
+    @classmethod
+    def from_pretrained(cls, name: str, *, chunk: int | None = None) -> DynamicPlanner:
+        """A planner with the weights that ship with the package: ``"trapper-ik"``.
+
+        Raises:
+            InputError: there is no planner of that name; the message lists those there are.
+            WeightsError: the weights cannot be read.
+        """
+        check_choice("planner", name, PRETRAINED)
+        from torchdyn_plan.nets import ETANetwork, Forecaster
+
+        static, forecaster, eta = PRETRAINED[name]
+        parts = static(chunk=chunk), Forecaster.from_pretrained(forecaster), ETANetwork.from_pretrained(eta)
+        return cls(*parts, chunk=chunk).eval().requires_grad_(False)

@@ -1,0 +1,162 @@
+"""The static planner by inverse kinematics: damped least squares, five steps of the path at a time."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import torch
+from tensordict import TensorDictBase
+from torch import Tensor, nn
+
+from torchdyn_plan import keys
+from torchdyn_plan.checks import check_number, check_trailing_shape
+from torchdyn_plan.kinematics.arm import Arm
+from torchdyn_plan.kinematics.dls import dls_step, limited_step, upright_error
+from torchdyn_plan.planners.rows import apply_to_rows
+
+PATH = (keys.PLAN, "path")
+PATH_STEP = (keys.PLAN, "path_step")
+PATH_GOAL = (keys.PLAN, "path_goal")
+
+
+@dataclass(frozen=True, kw_only=True)
+class Approach:
+    """How goals become tool positions: where the table is, how high to travel, where the box may stand."""
+
+    base_pos: tuple[float, float, float] = (0.0, -0.81, 0.05)
+    """Position of the arm's base frame in the world, axes parallel [m]."""
+    tool_length: float = 0.084
+    """Distance of the box mouth from the flange [m]."""
+    table_height: float = 0.035
+    """Goals at or below this height are on the table: the box is dropped over them [m]."""
+    down_height: float = 0.006
+    """Height of the box mouth when it is down [m]."""
+    travel_height: float = 0.075
+    """Height of the box mouth on its way to a goal on the table, above the ball [m]."""
+    clear_height: float = 0.055
+    """Below this the box does not move sideways, but lifts first [m]."""
+    drop_distance: float = 0.02
+    """Horizontal distance from the goal within which the box drops [m]."""
+    half_extent: float = 0.688
+    """The tool's place is clamped to the square of this half-side, which keeps the box clear of the rails [m]."""
+    min_radius: float = 0.2
+    """The tool keeps at least this distance from the arm's vertical axis [m]."""
+    max_radius: float = 0.91
+    """The tool keeps at most this distance from the arm's vertical axis [m]."""
+
+    def __post_init__(self) -> None:
+        for name in ("tool_length", "down_height", "travel_height", "drop_distance", "half_extent", "max_radius"):
+            check_number(name, getattr(self, name), minimum=0.0)
+
+
+class IKPlanner(nn.Module):
+    """Drives the arm to ``goal`` with its box upright and square; a goal on the table is approached from above.
+
+    Reads ``joint_pos`` (*B, 6) [rad], ``goal`` (*B, 3) [m, world] and ``step_count`` (*B,); writes ``action`` (*B, 6)
+    and its path under ``plan``. A path of `PATH_LENGTH` steps is solved at a time and flushed when the goal changes
+    (paper, Section III-B.1). Goals outside the table or the arm's reach are clamped to the nearest place inside.
+    """
+
+    PATH_LENGTH = 5
+    in_keys = (keys.JOINT_POS, keys.GOAL, keys.STEP_COUNT)
+    out_keys = (keys.ACTION, PATH, PATH_STEP, PATH_GOAL)
+
+    def __init__(
+        self,
+        arm: Arm | None = None,
+        *,
+        approach: Approach | None = None,
+        control_step: float = 0.004,
+        damping: float = 0.02,
+        gain: float = 0.15,
+        chunk: int | None = None,
+    ) -> None:
+        """Plan for ``arm`` (the UR5 of Trapper by default) at ``control_step`` [s].
+
+        Args:
+            arm: a six-joint arm whose tool frame is the box mouth, z axis out of it.
+            approach: how goals become tool positions.
+            control_step: time between two actions [s].
+            damping: λ of the least squares.
+            gain: share of the remaining joint error that one step may cover, which brakes the arm at the end.
+            chunk: solve in blocks of exactly this many rows, so that results do not depend on the batch size.
+        """
+        super().__init__()
+        self.approach = approach or Approach()
+        self.arm = arm or Arm.ur5(tool_length=self.approach.tool_length)
+        self.damping, self.gain, self.chunk = damping, gain, chunk
+        self.register_buffer("_base", torch.tensor(self.approach.base_pos, dtype=self.arm.lower.dtype), False)
+        self.register_buffer("_limit", self.arm.speed_limit * control_step, False)
+
+    def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
+        """Write ``action`` for the ``goal`` in ``tensordict``, planning anew where the path is used up or stale."""
+        joint_pos, goal = tensordict[keys.JOINT_POS], tensordict[keys.GOAL]
+        check_trailing_shape(keys.GOAL, goal, 3)
+        path, path_step, path_goal = (tensordict.get(key, None) for key in (PATH, PATH_STEP, PATH_GOAL))
+        if path is None:
+            path = joint_pos.new_zeros(*joint_pos.shape[:-1], self.PATH_LENGTH, joint_pos.shape[-1])
+            path_step = torch.full(joint_pos.shape[:-1], self.PATH_LENGTH, device=joint_pos.device)
+            path_goal = goal
+        stale = (path_step >= self.PATH_LENGTH) | (path_goal != goal).any(-1)
+        stale |= tensordict[keys.STEP_COUNT].reshape(stale.shape) == 0
+        (path,) = apply_to_rows(lambda q, g: (self.path(q, g),), stale, (joint_pos, goal), (path,), chunk=self.chunk)
+        path_step = torch.where(stale, 0, path_step)
+        index = path_step[..., None, None].expand(*path_step.shape, 1, path.shape[-1])
+        tensordict[keys.ACTION] = path.gather(-2, index).squeeze(-2)
+        tensordict[PATH], tensordict[PATH_STEP], tensordict[PATH_GOAL] = path, path_step + 1, goal
+        return tensordict
+
+    def path(self, joint_pos: Tensor, goal: Tensor) -> Tensor:
+        """Next `PATH_LENGTH` actions from ``joint_pos`` (*B, N) towards ``goal`` (*B, 3) [m, world]: (*B, 5, N)."""
+        target, on_table = self.tool_target(goal)
+        actions = []
+        for _ in range(self.PATH_LENGTH):
+            pose, jacobian = self.arm.pose_and_jacobian(joint_pos)
+            way = way_to(pose[..., :3, 3], target - self._base, on_table, self.approach, self._base[2])
+            error = torch.cat([way, upright_error(pose[..., :3, :3])], dim=-1)
+            step = limited_step(dls_step(jacobian, error, self.damping), self._limit, self.gain)
+            after = torch.clamp(joint_pos + step, self.arm.lower, self.arm.upper)
+            actions.append((after - joint_pos) / self._limit)
+            joint_pos = after
+        return torch.stack(actions, dim=-2)
+
+    def tool_target(self, goal: Tensor) -> tuple[Tensor, Tensor]:
+        """Place of the box mouth for ``goal`` (*B, 3), both [m, world], and whether the goal is on the table (*B,)."""
+        a = self.approach
+        on_table = goal[..., 2] <= a.table_height
+        place = goal[..., :2].clamp(-a.half_extent, a.half_extent) - self._base[:2]
+        radius = place.norm(dim=-1, keepdim=True).clamp_min(1e-6)
+        place = place * (radius.clamp(a.min_radius, a.max_radius) / radius) + self._base[:2]
+        place = place.clamp(-a.half_extent, a.half_extent)
+        height = torch.where(on_table, a.down_height, goal[..., 2])
+        return torch.cat([place, height.unsqueeze(-1)], dim=-1), on_table
+
+
+def way_to(tool: Tensor, target: Tensor, on_table: Tensor, approach: Approach, base_height: Tensor | float) -> Tensor:
+    """Displacement that a tool has still to make, ``(*B, 3)`` [m], as a velocity direction at ``tool``.
+
+    Sideways the way is taken in polar coordinates about the arm's axis (out of its own way, pan and reach at once).
+    A goal on the table is approached at the travel height; the box drops within the drop distance, and a box that is
+    low lifts before it moves.
+
+    Args:
+        tool: ``(*B, 3)`` [m], base frame.
+        target: ``(*B, 3)`` [m], base frame.
+        on_table: ``(*B,)`` bool.
+        approach: heights and distances.
+        base_height: height of the base above the table [m].
+    """
+    x, y, height = tool[..., 0], tool[..., 1], tool[..., 2] + base_height
+    radius = torch.hypot(x, y).clamp_min(1e-6)
+    away = torch.hypot(target[..., 0] - x, target[..., 1] - y)
+    reach = torch.hypot(target[..., 0], target[..., 1]) - radius
+    cross, dot = x * target[..., 1] - y * target[..., 0], x * target[..., 0] + y * target[..., 1]
+    turn = torch.atan2(cross, dot)
+    forward = reach / radius
+    side = torch.stack([x * forward - y * turn, y * forward + x * turn], dim=-1)
+    far = ((away - approach.drop_distance) / 0.015).clamp(0.0, 1.0)
+    lift = approach.travel_height - approach.down_height
+    wanted = target[..., 2] + base_height + torch.where(on_table, lift * far, 0.0)
+    low = torch.maximum(far, (~on_table).to(far.dtype)) * (approach.clear_height - height) / 0.02
+    side = side * (1.0 - low.clamp(0.0, 1.0)).unsqueeze(-1)
+    return torch.cat([side, (wanted - height).unsqueeze(-1)], dim=-1)

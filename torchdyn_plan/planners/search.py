@@ -1,0 +1,103 @@
+"""Where and when robot and target will meet: the choice of a goal on a forecast path."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from functools import partial
+from typing import TYPE_CHECKING, Literal, NamedTuple
+
+import torch
+from torch import Tensor
+
+from torchdyn_plan.checks import check_choice, check_trailing_shape
+
+if TYPE_CHECKING:
+    from torchdyn_plan.nets.eta import Arrival
+
+CORNERS = ((1.0, 1.0, 0.0), (1.0, -1.0, 0.0), (-1.0, -1.0, 0.0), (-1.0, 1.0, 0.0))
+
+
+class SearchResult(NamedTuple):
+    """A meeting of robot and target."""
+
+    goal: Tensor
+    """``(*B, 3)`` [m, world]: where they meet."""
+    arrival_steps: Tensor
+    """``(*B,)`` int64: control steps from now to the meeting, at most the horizon."""
+    clamped: Tensor
+    """``(*B,)`` bool: an arrival that decided the goal lay beyond the horizon and was cut to it."""
+    reachable: Tensor
+    """``(*B,)`` bool: false where the robot never arrives at any candidate, and the goal is only a direction."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class CornerSearch:
+    """The paper's search: the corners of a square around the target, in two passes of the arrival predictor."""
+
+    reading: Literal["mode", "expectation"] = "mode"
+    """How the predicted distribution of arrival times is read; the paper takes the likeliest bin."""
+
+    def __post_init__(self) -> None:
+        check_choice("reading", self.reading, ("mode", "expectation"))
+
+    def __call__(self, forecast: Tensor, target_pos: Tensor, eta: Callable[..., Arrival]) -> SearchResult:
+        """Choose a goal as `search_corners` does; ``eta`` also takes the keyword ``reading``."""
+        return search_corners(forecast, target_pos, partial(eta, reading=self.reading))
+
+
+def search_corners(forecast: Tensor, target_pos: Tensor, eta: Callable[[Tensor], Arrival]) -> SearchResult:
+    """Approximate the meeting s̃_{e*} = g̃, ETA(g̃) = e* by four corners (paper, Section III-B.4).
+
+    With the time to the target's present place, e_t = ETA(s_t), the square's half-edge is d = D(s̃_{e_t}, s_t). Of its
+    corners c_i, reached in e_i = ETA(c_i) steps, c* is the one nearest to the forecast, argmin D(c_i, s̃_{e_i}); its
+    time is e* and the goal g̃ = s̃_{e*}. D is the distance in space; the first of equal corners wins.
+
+    A corner at which the robot never arrives is chosen only if it never arrives at any, which `reachable` tells. If
+    it never arrives at the target's present place, the horizon's end gives the half-edge.
+
+    Args:
+        forecast: ``(*B, F, 3)`` [m, world], target positions in 1 … F control steps; a meeting in e steps is entry e-1.
+        target_pos: ``(*B, 3)`` [m, world], the target now: a meeting in 0 steps.
+        eta: maps goals ``(*B, K, 3)`` to arrivals ``(*B, K)``; called with K = 1, then with K = 4.
+
+    Returns:
+        The meeting; indices beyond the horizon are cut to F, which `clamped` tells.
+
+    Raises:
+        InputError: ``target_pos`` or ``forecast`` has another shape, or their batches differ.
+    """
+    check_trailing_shape("target_pos", target_pos, 3)
+    horizon = forecast.shape[-2] if forecast.ndim > 1 else 1
+    check_trailing_shape("forecast", forecast, *target_pos.shape[:-1], horizon, 3)
+    path = torch.cat([target_pos.unsqueeze(-2), forecast], dim=-2)
+
+    here = eta(target_pos.unsqueeze(-2))
+    steps, beyond_here = _on_path(here.steps, horizon)
+    steps = torch.where(here.never, horizon, steps)
+    half_edge = torch.linalg.vector_norm(_at(path, steps) - target_pos.unsqueeze(-2), dim=-1, keepdim=True)
+
+    corners = target_pos.unsqueeze(-2) + half_edge * target_pos.new_tensor(CORNERS)
+    arrival = eta(corners)
+    steps, beyond = _on_path(arrival.steps, horizon)
+    met = _at(path, steps)
+    miss = torch.linalg.vector_norm(corners - met, dim=-1)
+    nowhere = arrival.never.all(dim=-1, keepdim=True)
+    best = miss.masked_fill(arrival.never & ~nowhere, torch.inf).argmin(dim=-1, keepdim=True)
+    return SearchResult(
+        goal=_at(met, best).squeeze(-2),
+        arrival_steps=steps.gather(-1, best).squeeze(-1),
+        clamped=(beyond.gather(-1, best) | (beyond_here & ~here.never)).squeeze(-1),
+        reachable=~nowhere.squeeze(-1),
+    )
+
+
+def _on_path(steps: Tensor, horizon: int) -> tuple[Tensor, Tensor]:
+    """Whole steps within 0 … horizon, int64, and whether ``steps`` lay beyond; both of the shape of ``steps``."""
+    whole = steps.round()
+    return whole.clamp(0, horizon).to(torch.int64), whole > horizon
+
+
+def _at(path: Tensor, index: Tensor) -> Tensor:
+    """Entries ``index`` (*B, K) of ``path`` (*B, T, 3): (*B, K, 3)."""
+    return path.gather(-2, index.unsqueeze(-1).expand(*index.shape, 3))

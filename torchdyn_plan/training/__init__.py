@@ -1,0 +1,1 @@
+"""Data collection and supervised training of the networks."""

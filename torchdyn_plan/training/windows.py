@@ -1,0 +1,136 @@
+"""Windows of a target's recorded path: the history that a forecaster sees and the future that it should emit."""
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import NamedTuple
+
+import torch
+from safetensors import SafetensorError
+from safetensors.torch import load_file
+from torch import Tensor
+
+from torchdyn_plan.checks import check_number
+from torchdyn_plan.errors import InputError
+
+
+class Paths(NamedTuple):
+    """Recorded paths of E episodes, end to end."""
+
+    positions: Tensor
+    """(T, 3) [m, world], one per control step."""
+    start: Tensor
+    """(E,) int64 index of each episode's position at its reset."""
+    length: Tensor
+    """(E,) int64 samples of each episode."""
+    pocketed: Tensor
+    """(E,) bool: the last sample is a swallowed target, which stays there for ever."""
+
+
+class Windows(NamedTuple):
+    """A batch of windows."""
+
+    history: Tensor
+    """(*B, H, 3) [m, world], padded at the front with the first sample."""
+    history_length: Tensor
+    """(*B,) int64 rows of the history that are no padding."""
+    future: Tensor
+    """(*B, F, 3) [m, world]."""
+    pocketed: Tensor
+    """(*B,) bool: the target is swallowed within the window."""
+    moving: Tensor
+    """(*B,) bool: the target moves at the window's present."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class WindowConfig:
+    """How windows are drawn from paths."""
+
+    history: int = 24
+    """Positions H before and at the present."""
+    horizon: int = 300
+    """Positions F after it."""
+    first_step: int = 13
+    """Earliest present: the step of the first plan."""
+    windows_per_episode: int = 5
+    """Windows drawn from an episode in an epoch, fresh ones in each."""
+    early_share: float = 0.2
+    """Share of windows whose present lies between ``first_step`` and H, so that their history is padded."""
+    shortened_share: float = 0.2
+    """Share of windows anywhere whose history is padded as if the episode had just begun."""
+    still_speed: float = 2e-4
+    """Motion below which a target counts as still [m a step]."""
+
+    def __post_init__(self) -> None:
+        for name in ("history", "horizon", "first_step", "windows_per_episode"):
+            check_number(name, getattr(self, name), minimum=1, integer=True)
+        for name in ("early_share", "shortened_share"):
+            check_number(name, getattr(self, name), minimum=0.0, maximum=1.0)
+        check_number("still_speed", self.still_speed, minimum=0.0)
+
+
+def load_paths(folder: Path) -> Paths:
+    """Every ``paths-*.safetensors`` of ``folder`` as one; raises `InputError` if there is none or one is broken."""
+    parts: list[Paths] = []
+    offset = 0
+    for shard in read_shards(folder, "paths", ("positions", "start", "length", "pocketed")):
+        parts.append(Paths(shard["positions"], shard["start"] + offset, shard["length"], shard["pocketed"]))
+        offset += len(shard["positions"])
+    return Paths(*(torch.cat(tensors) for tensors in zip(*parts, strict=True)))
+
+
+def read_shards(folder: Path, stem: str, names: tuple[str, ...]) -> list[dict[str, Tensor]]:
+    """Tensors of every ``stem-*.safetensors`` in ``folder``; raises `InputError` naming what is missing or broken."""
+    files = sorted(Path(folder).glob(f"{stem}-*.safetensors"))
+    if not files:
+        raise InputError(f"no {stem}-*.safetensors in {str(folder)!r}")
+    shards = []
+    for file in files:
+        try:
+            shard = load_file(file)
+        except (SafetensorError, OSError) as error:
+            raise InputError(f"{str(file)!r} is not a whole safetensors file: {error}") from error
+        missing = [name for name in names if name not in shard]
+        if missing:
+            raise InputError(f"{str(file)!r} lacks {', '.join(missing)}")
+        shards.append(shard)
+    return shards
+
+
+def last_useful_step(paths: Paths, config: WindowConfig) -> Tensor:
+    """Latest present of a window, (E,) int64: its future is recorded, and the target has moved until shortly before."""
+    step = torch.nn.functional.pad(paths.positions.diff(dim=0).norm(dim=-1), (1, 0))
+    episode = torch.repeat_interleave(torch.arange(len(paths.length)), paths.length)
+    index = torch.arange(len(paths.positions)) - paths.start[episode]
+    moved = torch.where((step > config.still_speed) & (index > 0), index, 0)
+    last_moved = torch.zeros_like(paths.length).scatter_reduce(0, episode, moved, "amax")
+    recorded = torch.where(paths.pocketed, paths.length - 2, paths.length - 1 - config.horizon)
+    return torch.minimum(recorded, last_moved + config.history)
+
+
+def draw_windows(
+    paths: Paths, last_step: Tensor, episodes: Tensor, config: WindowConfig, generator: torch.Generator
+) -> Windows:
+    """One random window of each of ``episodes`` (M,), whose presents may run to ``last_step`` (E,)."""
+    shape = episodes.shape
+    chance, place, kind, cut = torch.rand((4, *shape), generator=generator)
+    last = last_step[episodes]
+    # Squared: presents lie denser where targets are still fast.
+    latest = torch.where(chance < config.early_share, last.clamp(max=config.history), last)
+    present = config.first_step + (place.square() * (latest - config.first_step + 1)).long()
+    shortest = min(config.first_step, config.history)
+    shortened = shortest + (cut * (config.history - shortest + 1)).long()
+    seen = torch.where(kind < config.shortened_share, shortened, config.history)
+    return cut_windows(paths, episodes, present, torch.minimum(seen, present), config)
+
+
+def cut_windows(paths: Paths, episodes: Tensor, present: Tensor, seen: Tensor, config: WindowConfig) -> Windows:
+    """Windows at steps ``present`` (M,) of ``episodes`` (M,), of whose history ``seen`` (M,) rows are no padding."""
+    offset = torch.arange(1 - config.history, config.horizon + 1)
+    step = (present.unsqueeze(-1) + offset).clamp(min=(present - seen).unsqueeze(-1))
+    last = paths.length[episodes] - 1
+    index = paths.start[episodes].unsqueeze(-1) + torch.minimum(step, last.unsqueeze(-1))
+    track = paths.positions[index]
+    history, future = track[..., : config.history, :], track[..., config.history :, :]
+    moving = (history[..., -1, :] - history[..., -2, :]).norm(dim=-1) > config.still_speed
+    pocketed = paths.pocketed[episodes] & (last <= present + config.horizon)
+    return Windows(history, seen.clamp(max=config.history), future, pocketed, moving)
