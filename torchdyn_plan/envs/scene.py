@@ -22,29 +22,29 @@ GRAVITY = 9.81
 class TrapperScene:
     """Geometry and physics of Trapper. Frame: z up, table surface at z = 0, table centre at the origin, arm at -y."""
 
-    table_side: float = 1.5
+    table_side: float = 1.58
     """Side of the square playing area, from cushion to cushion [m]."""
     rail_width: float = 0.12
     """[m]"""
     rail_height: float = 0.05
     """[m]"""
-    pocket_gap: float = 0.14
+    pocket_gap: float = 0.22
     """Free width of a pocket between two rail segments [m]."""
-    pocket_offset: float = 0.375
+    pocket_offset: float = 0.395
     """Distance of a pocket's middle from the middle of its wall [m]."""
-    ball_radius: float = 0.025
+    ball_radius: float = 0.037
     """[m]"""
-    ball_mass: float = 0.5
+    ball_mass: float = 4.05
     """[kg]"""
     rolling_resistance: float = 0.0001
     """Lever arm of the cloth's resistance to rolling [m]; deceleration is 5/7·g·lever/radius."""
-    cloth_friction: float = 0.2
+    cloth_friction: float = 0.1
     """Sliding friction coefficient of ball on cloth."""
     cushion_stiffness: float = 100000.0
     """Stiffness of a cushion per effective mass [1/s²]."""
-    cushion_damping: float = 40.0
+    cushion_damping: float = 10.0
     """Damping of a cushion per effective mass [1/s]."""
-    box_half_width: float = 0.055
+    box_half_width: float = 0.06
     """Inner half-width of the box [m]."""
     box_wall: float = 0.004
     """[m]"""
@@ -56,13 +56,13 @@ class TrapperScene:
     """Distance of the arm's base axis behind the cushion line [m]."""
     base_height: float = 0.05
     """Height of the arm's base above the table [m]."""
-    home: tuple[float, float, float, float, float, float] = (-1.8788, -1.7099, 2.3804, -2.2414, -1.5708, -0.308)
+    home: tuple[float, float, float, float, float, float] = (-1.7537, -1.1269, 1.7746, -2.2185, -1.5708, -0.1829)
     """Initial joint angles [rad]."""
     servo_stiffness: tuple[float, ...] = (8000.0, 8000.0, 6000.0, 1200.0, 1200.0, 1200.0)
     """Position gain of each joint [N·m/rad]."""
     servo_damping: tuple[float, ...] = (400.0, 400.0, 300.0, 60.0, 60.0, 60.0)
     """Speed gain of each joint [N·m·s/rad]."""
-    acceleration_limit: float = 100.0
+    acceleration_limit: float = 150.0
     """Greatest change of a commanded joint speed [rad/s²]."""
     substep: float = 0.002
     """Physics step [s]."""

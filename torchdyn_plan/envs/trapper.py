@@ -6,7 +6,7 @@ from typing import Any
 
 import torch
 from tensordict import TensorDict, TensorDictBase
-from torch import Tensor
+from torch import Tensor, nn
 from torchrl.data import Binary, Bounded, Composite, Unbounded
 from torchrl.envs import EnvBase
 
@@ -20,6 +20,11 @@ from torchdyn_plan.kinematics.arm import Arm
 
 HOLD_STEPS = 10
 """Control steps for which a ball must stay covered to count as trapped."""
+MAX_STEPS = 500
+"""Control steps of an episode: two seconds."""
+
+ROWS = 32
+"""Arms whose kinematics are computed at a time."""
 
 
 class TrapperEnv(EnvBase):
@@ -42,7 +47,7 @@ class TrapperEnv(EnvBase):
         split: str = "train",
         scene: TrapperScene | None = None,
         history: int = 24,
-        max_steps: int = 500,
+        max_steps: int = MAX_STEPS,
         num_threads: int = 0,
     ) -> None:
         """Build the batch.
@@ -90,15 +95,16 @@ class TrapperEnv(EnvBase):
         }  # fmt: skip
         if self.static:
             vectors[keys.GOAL] = (3,)
-        specs: dict[str, Any] = {key: Unbounded(shape=(n, *shape)) for key, shape in vectors.items()}
+        one = torch.Size((n, 1))
+        specs: dict[str, Any] = {key: Unbounded(torch.Size((n, *shape))) for key, shape in vectors.items()}
         for key in (keys.HISTORY_LENGTH, keys.STEP_COUNT, keys.EPISODE):
-            specs[key] = Unbounded(shape=(n,), dtype=torch.int64)
+            specs[key] = Unbounded(self.batch_size, dtype=torch.int64)
         for key in (keys.TRAPPED, keys.POCKETED):
-            specs[key] = Binary(shape=(n, 1), dtype=torch.bool)
+            specs[key] = Binary(shape=one, dtype=torch.bool)
         self.observation_spec = Composite(specs, shape=(n,))
-        self.action_spec = Bounded(-1.0, 1.0, shape=(n, 6))
-        self.reward_spec = Unbounded(shape=(n, 1))
-        done = {key: Binary(shape=(n, 1), dtype=torch.bool) for key in ("done", "terminated", "truncated")}
+        self.action_spec = Bounded(-1.0, 1.0, shape=torch.Size((n, 6)))
+        self.reward_spec = Unbounded(one)
+        done = {key: Binary(shape=one, dtype=torch.bool) for key in ("done", "terminated", "truncated")}
         self.done_spec = Composite(done, shape=(n,))
 
     def start_from(self, episode: int) -> None:
@@ -116,14 +122,14 @@ class TrapperEnv(EnvBase):
         if len(rows):
             episodes = torch.arange(self._next_episode, self._next_episode + len(rows))
             self._next_episode += len(rows)
-            place, speed = draw_starts(
-                self.scene, episodes, velocity=self.velocity, split=self.split, seed=self.seed
-            )  # fmt: skip
+            place, speed = draw_starts(self.scene, episodes, velocity=self.velocity, split=self.split, seed=self.seed)
             self.simulation.reset(rows, place, speed)
             self._episode[rows] = episodes
             self._steps[rows] = self._held[rows] = 0
+            # A copy: what an earlier step returned shares the old one.
+            self._trace = self._trace.clone()
             self._trace[rows] = self.simulation.ball_pos[rows].float().unsqueeze(1)
-        tool, _ = self._tool()
+        tool = self._tool()[0]
         result = self._observe(tool, torch.zeros(self.num_envs, dtype=torch.bool))
         for key in ("done", "terminated", "truncated"):
             result[key] = torch.zeros(self.num_envs, 1, dtype=torch.bool)
@@ -150,7 +156,9 @@ class TrapperEnv(EnvBase):
 
     def _tool(self) -> tuple[Tensor, Tensor]:
         """Place (N, 3) [m, world] and rotation (N, 3, 3) of the box mouth."""
-        pose = self._arm(self.simulation.joint_pos.float())
+        # Matrix products may differ in the last bit with the number of rows, so it is always the same.
+        padded = nn.functional.pad(self.simulation.joint_pos.float(), (0, 0, 0, -self.num_envs % ROWS))
+        pose = torch.cat([self._arm(block) for block in padded.split(ROWS)])[: self.num_envs]
         return pose[:, :3, 3] + self._base, pose[:, :3, :3]
 
     def _observe(self, tool: Tensor, trapped: Tensor) -> TensorDict:

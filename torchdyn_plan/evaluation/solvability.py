@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 from collections.abc import Callable
 from pathlib import Path
+from typing import Any, NamedTuple
 
 import torch
 from safetensors import SafetensorError
@@ -14,36 +15,111 @@ from torch import Tensor
 
 from torchdyn_plan.envs.reaching import ReachingTask
 from torchdyn_plan.envs.scene import TrapperScene
-from torchdyn_plan.envs.trapping import SLACK
+from torchdyn_plan.envs.simulation import TrapperSimulation
+from torchdyn_plan.envs.trapping import is_pocketed
 from torchdyn_plan.files import write_whole
-from torchdyn_plan.planners.ik import IKPlanner
 
-GRID = 0.02
-"""Spacing of the map [m]."""
+SPACING = 0.02
+"""Greatest distance between neighbouring points of a map [m]."""
 LONGEST = 500
 """Control steps after which an arm that has not arrived never does."""
-SHIPPED = Path(__file__).parent.parent / "weights"
 NEVER = 2**20
+"""Arrival at a place that the arm never reaches [control steps]."""
+SHIPPED = Path(__file__).parent.parent / "weights"
+"""Folder of the maps that come with the package."""
 
 
-class ArrivalMap:
-    """Measured steps from the home pose, at rest, to covering a ball at each place of the table."""
+class ArrivalMap(NamedTuple):
+    """Measured control steps from rest at home until a ball at a place of the table would be covered."""
 
-    def __init__(self, scene: TrapperScene, steps: Tensor) -> None:
-        """Wrap ``steps`` (n, n) int64, x by y over the places where a box can stand over a ball; `NEVER` for never."""
-        self.scene, self.steps = scene, steps
-
-    @staticmethod
-    def limit(scene: TrapperScene) -> float:
-        """Greatest |x| or |y| at which a ball can be covered [m]: nearer to a cushion the box would touch it."""
-        approach = IKPlanner.default_approach(scene_free=True) if False else None
-        del approach
-        return scene.half_side - scene.box_outer - CLEARANCE + scene.box_half_width - scene.ball_radius + SLACK
+    steps: Tensor
+    """``(n, n)`` int64, x by y over the whole table; `NEVER` where the arm does not arrive."""
+    half_side: float
+    """Half of the table's side: the grid runs from -half_side to half_side [m]."""
 
     def at(self, place: Tensor) -> Tensor:
-        """Steps to the nearest point of the map, ``(*B,)`` int64, for places ``(*B, 2 or 3)`` [m, world]."""
-        limit, count = self.limit(self.scene), len(self.steps)
-        index = ((place[..., :2] + limit) / (2 * limit) * (count - 1)).round().long()
-        inside = ((index >= 0) & (index < count)).all(-1)
-        index = index.clamp(0, count - 1)
+        """Steps at the map's point next to ``place`` (*B, 2 or 3) [m, world]: ``(*B,)`` int64."""
+        last = len(self.steps) - 1
+        index = ((place[..., :2] / self.half_side + 1.0) * (last / 2)).round().long()
+        inside = ((index >= 0) & (index <= last)).all(-1)
+        index = index.clamp(0, last)
         return torch.where(inside, self.steps[index[..., 0], index[..., 1]], NEVER)
+
+
+def is_solvable(arrivals: ArrivalMap, scene: TrapperScene, path: Tensor) -> Tensor:
+    """Whether for some t the arm, from rest at home, can be at the ball's place at step t within t steps: ``(*B,)``.
+
+    Args:
+        arrivals: measured arrivals of the static planner.
+        scene: where pockets are deep.
+        path: ``(*B, T, 3)`` true positions of the ball at steps 0 … T-1, the arm held still [m, world].
+    """
+    in_time = arrivals.at(path) <= torch.arange(path.shape[-2])
+    return (in_time & ~is_pocketed(scene, path)).any(-1)
+
+
+def record_path(
+    scene: TrapperScene, place: Tensor, velocity: Tensor, *, steps: int, friction: float = 0.0, num_threads: int = 0
+) -> Tensor:
+    """True positions ``(M, steps + 1, 3)`` [m, world] of balls that start at ``place`` with ``velocity``, (M, 2) each.
+
+    The arm's home pose touches no ball, so the ball rolls alone.
+    """
+    simulation = TrapperSimulation(len(place), scene, friction=friction, num_threads=num_threads, arm=False)
+    simulation.reset(torch.arange(len(place)), place, velocity)
+    path = torch.empty(len(place), steps + 1, 3)
+    path[:, 0] = simulation.ball_pos
+    for step in range(1, steps + 1):
+        simulation.step()
+        path[:, step] = simulation.ball_pos
+    return path
+
+
+def measure_arrivals(
+    planner: Callable[[TensorDictBase], TensorDictBase], scene: TrapperScene, *, num_threads: int = 0
+) -> ArrivalMap:
+    """Run ``planner`` from home to every point of a grid over the table, and look when it is there."""
+    from tqdm import tqdm
+
+    count = int(-(-scene.table_side // SPACING)) + 1
+    line = torch.linspace(-scene.half_side, scene.half_side, count)
+    grid = torch.cartesian_prod(line, line)
+    goals = torch.cat([grid, torch.full((len(grid), 1), scene.ball_radius)], dim=-1)
+    task = ReachingTask(planner, len(goals), scene=scene, num_threads=num_threads)
+    arrived = torch.full((len(goals),), NEVER)
+    for step in tqdm(range(LONGEST + 1), desc="measure arrivals", unit="step", leave=False):
+        arrived = torch.where((arrived == NEVER) & task.is_reached(goals), step, arrived)
+        task.step(goals)
+    return ArrivalMap(arrived.view(count, count), scene.half_side)
+
+
+def arrival_map(
+    static: str, planner: Callable[[TensorDictBase], TensorDictBase], scene: TrapperScene, *, num_threads: int = 0
+) -> ArrivalMap:
+    """The map of the static planner called ``static`` in ``scene``: shipped, cached, or measured now and cached."""
+    name = f"arrivals-{static}-{scene.digest()}.safetensors"
+    for folder in (SHIPPED, _cache()):
+        steps = _load(folder / name)
+        if steps is not None:
+            return ArrivalMap(steps.long(), scene.half_side)
+    arrivals = measure_arrivals(planner, scene, num_threads=num_threads)
+    save_arrivals(arrivals, _cache() / name)
+    return arrivals
+
+
+def save_arrivals(arrivals: ArrivalMap, path: Path) -> None:
+    """Write the map to ``path``, whole or not at all."""
+    write_whole(path, lambda temporary: save_file({"steps": arrivals.steps.int()}, temporary))
+
+
+def _load(path: Path) -> Tensor | None:
+    """Steps in the file; None if there is none, or a damaged one, which is measured again."""
+    try:
+        content: dict[str, Any] = load_file(path)
+        return content["steps"]
+    except (OSError, SafetensorError, KeyError):
+        return None
+
+
+def _cache() -> Path:
+    return Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "torchdyn_plan"

@@ -56,7 +56,7 @@ class Arm(nn.Module):
             "_frequencies": form.frequencies, "_phases": form.phases, "_weights": form.weights,
         }  # fmt: skip
         for name, value in constants.items():
-            self.register_buffer(name, torch.as_tensor(value).to(dtype=dtype, device=device), persistent=False)
+            self.register_buffer(name, torch.as_tensor(value, dtype=dtype, device=device), persistent=False)
 
     @classmethod
     def ur5(

@@ -41,7 +41,9 @@ class ETAConfig:
         object.__setattr__(self, "tool_slice", tuple(self.tool_slice))
         first, last = self.tool_slice
         if not 0 <= first < last <= self.robot_state_size or last - first != 3:
-            raise InputError(f"tool_slice must span 3 entries of a robot state of {self.robot_state_size}, got {self.tool_slice}")
+            raise InputError(
+                f"tool_slice must span 3 entries of a robot state of {self.robot_state_size}, got {self.tool_slice}"
+            )
 
 
 class ETANetwork(Pretrained, nn.Module):
@@ -182,4 +184,14 @@ def arrival_classes(arrival: Tensor, *, bins: int = 100, bin_width: int = 5) -> 
     Returns:
         Probabilities ``(n, bins + 1)`` float32, and the class ``(n,)`` int64 that holds the time.
     """
-    raise NotImplementedError
+    never = (arrival < 0) | (arrival >= bins * bin_width)
+    holding = torch.where(never, bins, arrival.div(bin_width, rounding_mode="floor"))
+    place = ((arrival.to(torch.float32) - (bin_width - 1) / 2) / bin_width).clamp(0.0, bins - 1.0)
+    lower = place.long().clamp(max=max(bins - 2, 0))
+    share = place - lower
+    classes = torch.zeros(*arrival.shape, bins + 1, device=arrival.device)
+    classes.scatter_(-1, lower.unsqueeze(-1), (1.0 - share).unsqueeze(-1))
+    if bins > 1:
+        classes.scatter_(-1, lower.unsqueeze(-1) + 1, share.unsqueeze(-1))
+    sure = torch.nn.functional.one_hot(torch.full_like(holding, bins), bins + 1).to(classes.dtype)
+    return torch.where(never.unsqueeze(-1), sure, classes), holding

@@ -33,6 +33,8 @@ class ForecasterConfig:
     """Distance from the origin that counts as one [m]."""
     height_scale: float = 0.05
     """Height that counts as one [m]."""
+    change_scale: float = 2e-5
+    """Difference between two steps that counts as one [m]: what braking changes in a few control steps."""
     half_extent: float | None = None
     """Where the target's centre turns back at a square table's cushions, |x| or |y| [m]; None where space is open."""
     square_symmetry: bool = False
@@ -42,7 +44,7 @@ class ForecasterConfig:
         check_number("history", self.history, minimum=2, integer=True)
         for name in ("horizon", "channels", "convolutions", "hidden"):
             check_number(name, getattr(self, name), minimum=1, integer=True)
-        for name in ("step_scale", "length_scale", "height_scale"):
+        for name in ("step_scale", "length_scale", "height_scale", "change_scale"):
             check_number(name, getattr(self, name), minimum=1e-9)
         if self.half_extent is not None:
             check_number("half_extent", self.half_extent, minimum=1e-9)
@@ -68,13 +70,13 @@ class Forecaster(Pretrained, nn.Module):
         super().__init__()
         self.config = config = config or ForecasterConfig(**settings)
         channels, length = config.channels, config.history - 1
-        self.embed = nn.Conv1d(4, channels, 1)
+        self.embed = nn.Conv1d(7, channels, 1)
         self.convolve = nn.ModuleList(
             nn.Conv1d(channels, channels, 3, stride=2, padding=1) for _ in range(config.convolutions)
         )
         for _ in range(config.convolutions):
             length = (length + 1) // 2
-        self.join = nn.Linear(channels * length + 6, config.hidden)
+        self.join = nn.Linear(channels * length + self._present_size, config.hidden)
         self.hidden = nn.Linear(config.hidden, config.hidden)
         self.head = nn.Linear(config.hidden, 3 * config.horizon)
         nn.init.zeros_(self.head.bias)
@@ -117,21 +119,48 @@ class Forecaster(Pretrained, nn.Module):
     def _departure(self, now: Tensor, step: Tensor) -> Tensor:
         """Displacements ``(*B, F, 3)`` from the newest position ``(*B, 1, 3)`` after the steps ``(*B, H-1, 3)`` [m]."""
         config, batch = self.config, step.shape[:-2]
-        real = (step != 0).any(dim=-1, keepdim=True).to(step.dtype)
-        features = torch.cat([step / config.step_scale, real], dim=-1).flatten(0, -3) if batch else torch.cat(
-            [step / config.step_scale, real], dim=-1
-        ).unsqueeze(0)
+        features = self._step_features(step).reshape(-1, *step.shape[-2:-1], 7)
         features = torch.relu(self.embed(features.mT))
         for layer in self.convolve:
             features = torch.relu(layer(features))
-        newest = torch.cat([now.flatten(-2) / config.length_scale, step[..., -1, :] / config.step_scale], dim=-1)
-        joined = torch.cat([features.reshape(*batch, -1), newest], dim=-1)
+        present = self._present_features(now.squeeze(-2), step[..., -1, :])
+        joined = torch.cat([features.reshape(*batch, -1), present], dim=-1)
         hidden = torch.relu(self.hidden(torch.relu(self.join(joined))))
         out = self.head(hidden).unflatten(-1, (config.horizon, 3))
         level = self.steps_ahead * (step[..., -1:, :2] + config.step_scale * out[..., :2])
         return torch.cat([level, config.height_scale * out[..., 2:]], dim=-1)
 
+    def _step_features(self, step: Tensor) -> Tensor:
+        """Each step, its difference from the newest one, and whether it is no padding, ``(*B, H-1, 7)``."""
+        real = (step != 0).any(dim=-1, keepdim=True).to(step.dtype)
+        # Braking changes a step by a thousandth, a bounce by twice itself: a logarithm shows both.
+        change = torch.asinh((step - step[..., -1:, :]) / self.config.change_scale) * real
+        return torch.cat([step / self.config.step_scale, 0.2 * change, real], dim=-1)
+
+    def _present_features(self, now: Tensor, step: Tensor) -> Tensor:
+        """Newest position and step, ``(*B, 3)`` each, and when and where they lead to a cushion: ``(*B, P)``."""
+        config = self.config
+        features = [now / config.length_scale, step / config.step_scale]
+        if config.half_extent is not None:
+            ahead = config.half_extent - now[..., :2] * _direction(step[..., :2])
+            wait = (ahead / step[..., :2].abs().clamp(min=1e-6)).clamp(0.0, 2.0 * config.horizon)
+            meeting = now[..., :2] + step[..., :2] * wait.flip(-1)
+            features += [
+                wait / config.horizon,
+                torch.log1p(wait) / 4,
+                fold(meeting, config.half_extent) / config.length_scale,
+            ]
+        return torch.cat(features, dim=-1)
+
+    @property
+    def _present_size(self) -> int:
+        return 6 if self.config.half_extent is None else 12
+
     def _check(self, target_history: Tensor) -> None:
         check_trailing_shape("target_history", target_history, self.config.history, 3)
         check_same_device("target_history", target_history, self.head.weight.device, type(self).__name__)
         check_finite("target_history", target_history)
+
+
+def _direction(step: Tensor) -> Tensor:
+    return torch.where(step < 0, -1.0, 1.0)

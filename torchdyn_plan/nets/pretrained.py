@@ -2,6 +2,7 @@
 
 import dataclasses
 import json
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any, ClassVar, Self
 
@@ -23,7 +24,7 @@ class Pretrained:
 
     kind: ClassVar[str]
     """What its files are called before the name."""
-    config_type: ClassVar[type]
+    config_type: ClassVar[Callable[..., Any]]
     config: Any
 
     def save_pretrained(self, path: str | Path) -> Path:
@@ -40,7 +41,11 @@ class Pretrained:
         if file.suffix != ".safetensors":
             file = file / f"{self.kind}.safetensors"
         tensors = {name: value.detach().cpu().contiguous() for name, value in self.state_dict().items()}
-        metadata = {"format": FORMAT, "class": type(self).__name__, "config": json.dumps(dataclasses.asdict(self.config))}
+        metadata = {
+            "format": FORMAT,
+            "class": type(self).__name__,
+            "config": json.dumps(dataclasses.asdict(self.config)),
+        }
         write_whole(file, lambda temporary: save_file(tensors, temporary, metadata))
         return file
 
@@ -57,10 +62,10 @@ class Pretrained:
             found = metadata.get("class") or "no network of this package"
             raise WeightsError(f"{str(file)!r} holds {found}, expected {cls.__name__}")
         try:
-            network = cls(cls.config_type(**json.loads(metadata["config"])))
+            build: Any = cls
+            network = build(cls.config_type(**json.loads(metadata["config"])))
         except (KeyError, TypeError, json.JSONDecodeError, InputError) as error:
             raise WeightsError(f"{str(file)!r} has an invalid configuration of {cls.__name__}: {error}") from error
-        assert isinstance(network, nn.Module)
         _check_tensors(file, network.state_dict(), tensors)
         network.load_state_dict(tensors)
         return network.to(device).eval()

@@ -3,41 +3,43 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import partial
+from typing import Any
 
 import torch
-from tensordict import TensorDictBase
-from torch import Tensor, nn
+from tensordict import TensorDict, TensorDictBase
+from tensordict.nn import TensorDictModuleBase
+from torch import Tensor
 
 from torchdyn_plan import keys
-from torchdyn_plan.checks import check_number, check_trailing_shape
+from torchdyn_plan.checks import check_finite, check_number, check_trailing_shape
 from torchdyn_plan.kinematics.arm import Arm
 from torchdyn_plan.kinematics.dls import dls_step, limited_step, upright_error
+from torchdyn_plan.planners.protocol import read
 from torchdyn_plan.planners.rows import apply_to_rows
 
-PATH = (keys.PLAN, "path")
-PATH_STEP = (keys.PLAN, "path_step")
-PATH_GOAL = (keys.PLAN, "path_goal")
+PATH_NAMES = ("path", "path_step", "path_goal")
 
 
 @dataclass(frozen=True, kw_only=True)
 class Approach:
     """How goals become tool positions: where the table is, how high to travel, where the box may stand."""
 
-    base_pos: tuple[float, float, float] = (0.0, -0.81, 0.05)
+    base_pos: tuple[float, float, float] = (0.0, -0.85, 0.05)
     """Position of the arm's base frame in the world, axes parallel [m]."""
     tool_length: float = 0.084
     """Distance of the box mouth from the flange [m]."""
-    table_height: float = 0.035
+    table_height: float = 0.047
     """Goals at or below this height are on the table: the box is dropped over them [m]."""
     down_height: float = 0.006
     """Height of the box mouth when it is down [m]."""
-    travel_height: float = 0.075
+    travel_height: float = 0.089
     """Height of the box mouth on its way to a goal on the table, above the ball [m]."""
-    clear_height: float = 0.055
-    """Below this the box does not move sideways, but lifts first [m]."""
-    drop_distance: float = 0.02
+    clear_height: float = 0.079
+    """Below this the box slows sideways as it lifts, and 2 cm below it stands still sideways [m]."""
+    drop_distance: float = 0.025
     """Horizontal distance from the goal within which the box drops [m]."""
-    half_extent: float = 0.688
+    half_extent: float = 0.722
     """The tool's place is clamped to the square of this half-side, which keeps the box clear of the rails [m]."""
     min_radius: float = 0.2
     """The tool keeps at least this distance from the arm's vertical axis [m]."""
@@ -49,17 +51,18 @@ class Approach:
             check_number(name, getattr(self, name), minimum=0.0)
 
 
-class IKPlanner(nn.Module):
+class IKPlanner(TensorDictModuleBase):
     """Drives the arm to ``goal`` with its box upright and square; a goal on the table is approached from above.
 
     Reads ``joint_pos`` (*B, 6) [rad], ``goal`` (*B, 3) [m, world] and ``step_count`` (*B,); writes ``action`` (*B, 6)
     and its path under ``plan``. A path of `PATH_LENGTH` steps is solved at a time and flushed when the goal changes
-    (paper, Section III-B.1). Goals outside the table or the arm's reach are clamped to the nearest place inside.
+    (paper, Section III-B.1); rows with ``step_count`` 0 start afresh. Goals outside the table or the arm's reach are
+    clamped to a near place inside.
     """
 
     PATH_LENGTH = 5
-    in_keys = (keys.JOINT_POS, keys.GOAL, keys.STEP_COUNT)
-    out_keys = (keys.ACTION, PATH, PATH_STEP, PATH_GOAL)
+    _base: Tensor
+    _limit: Tensor
 
     def __init__(
         self,
@@ -68,7 +71,7 @@ class IKPlanner(nn.Module):
         approach: Approach | None = None,
         control_step: float = 0.004,
         damping: float = 0.02,
-        gain: float = 0.15,
+        gain: float = 0.25,
         chunk: int | None = None,
     ) -> None:
         """Plan for ``arm`` (the UR5 of Trapper by default) at ``control_step`` [s].
@@ -82,6 +85,11 @@ class IKPlanner(nn.Module):
             chunk: solve in blocks of exactly this many rows, so that results do not depend on the batch size.
         """
         super().__init__()
+        if chunk is not None:
+            check_number("chunk", chunk, minimum=1, integer=True)
+        self.in_keys = [keys.JOINT_POS, keys.GOAL, keys.STEP_COUNT]
+        written: list[Any] = [keys.ACTION, *((keys.PLAN, name) for name in PATH_NAMES)]
+        self.out_keys = written
         self.approach = approach or Approach()
         self.arm = arm or Arm.ur5(tool_length=self.approach.tool_length)
         self.damping, self.gain, self.chunk = damping, gain, chunk
@@ -89,25 +97,47 @@ class IKPlanner(nn.Module):
         self.register_buffer("_limit", self.arm.speed_limit * control_step, False)
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
-        """Write ``action`` for the ``goal`` in ``tensordict``, planning anew where the path is used up or stale."""
-        joint_pos, goal = tensordict[keys.JOINT_POS], tensordict[keys.GOAL]
-        check_trailing_shape(keys.GOAL, goal, 3)
-        path, path_step, path_goal = (tensordict.get(key, None) for key in (PATH, PATH_STEP, PATH_GOAL))
-        if path is None:
-            path = joint_pos.new_zeros(*joint_pos.shape[:-1], self.PATH_LENGTH, joint_pos.shape[-1])
-            path_step = torch.full(joint_pos.shape[:-1], self.PATH_LENGTH, device=joint_pos.device)
-            path_goal = goal
+        """Write ``action`` for the ``goal`` in ``tensordict``, planning anew where the path is used up or stale.
+
+        Raises:
+            InputError: a key is missing, a shape is wrong, or the goal holds a NaN or an infinity.
+        """
+        get = partial(read, tensordict, reader="IKPlanner")
+        joint_pos, goal, step_count = get(keys.JOINT_POS), get(keys.GOAL), get(keys.STEP_COUNT)
+        if not torch.compiler.is_compiling():
+            self._check(joint_pos, goal)
+        plan = tensordict.get(keys.PLAN, None)
+        path, path_step, path_goal = self._recall(plan, joint_pos, goal)
         stale = (path_step >= self.PATH_LENGTH) | (path_goal != goal).any(-1)
-        stale |= tensordict[keys.STEP_COUNT].reshape(stale.shape) == 0
+        stale |= step_count.reshape(stale.shape) == 0
         (path,) = apply_to_rows(lambda q, g: (self.path(q, g),), stale, (joint_pos, goal), (path,), chunk=self.chunk)
         path_step = torch.where(stale, 0, path_step)
         index = path_step[..., None, None].expand(*path_step.shape, 1, path.shape[-1])
-        tensordict[keys.ACTION] = path.gather(-2, index).squeeze(-2)
-        tensordict[PATH], tensordict[PATH_STEP], tensordict[PATH_GOAL] = path, path_step + 1, goal
+        tensordict.set(keys.ACTION, path.gather(-2, index).squeeze(-2))
+        entries = {} if plan is None else dict(plan.items())
+        entries.update(zip(PATH_NAMES, (path, path_step + 1, goal), strict=True))
+        # A new one each step: tensordicts of earlier steps may share the old one.
+        tensordict.set(keys.PLAN, TensorDict(entries, tensordict.batch_size, device=tensordict.device))
         return tensordict
+
+    def _recall(self, plan: TensorDictBase | None, joint_pos: Tensor, goal: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        """What was written into ``plan`` in the step before; a path that is used up if nothing was."""
+        if plan is not None and PATH_NAMES[0] in plan.keys():  # noqa: SIM118
+            path, path_step, path_goal = map(plan.get, PATH_NAMES)
+            return path, path_step, path_goal
+        path = joint_pos.new_zeros(*joint_pos.shape[:-1], self.PATH_LENGTH, joint_pos.shape[-1])
+        return path, torch.full(joint_pos.shape[:-1], self.PATH_LENGTH, device=joint_pos.device), goal
+
+    def _check(self, joint_pos: Tensor, goal: Tensor) -> None:
+        check_trailing_shape(keys.JOINT_POS, joint_pos, self.arm.num_joints)
+        check_trailing_shape(keys.GOAL, goal, *joint_pos.shape[:-1], 3)
+        # The sum is a quick look: only a sum that is not finite is worth the full one.
+        if not torch.isfinite(goal.sum()):
+            check_finite(keys.GOAL, goal)
 
     def path(self, joint_pos: Tensor, goal: Tensor) -> Tensor:
         """Next `PATH_LENGTH` actions from ``joint_pos`` (*B, N) towards ``goal`` (*B, 3) [m, world]: (*B, 5, N)."""
+        joint_pos, goal = joint_pos.to(self._base.dtype), goal.to(self._base.dtype)
         target, on_table = self.tool_target(goal)
         actions = []
         for _ in range(self.PATH_LENGTH):
@@ -115,9 +145,9 @@ class IKPlanner(nn.Module):
             way = way_to(pose[..., :3, 3], target - self._base, on_table, self.approach, self._base[2])
             error = torch.cat([way, upright_error(pose[..., :3, :3])], dim=-1)
             step = limited_step(dls_step(jacobian, error, self.damping), self._limit, self.gain)
-            after = torch.clamp(joint_pos + step, self.arm.lower, self.arm.upper)
-            actions.append((after - joint_pos) / self._limit)
-            joint_pos = after
+            step = torch.clamp(step, self.arm.lower - joint_pos, self.arm.upper - joint_pos)
+            actions.append((step / self._limit).clamp(-1.0, 1.0))
+            joint_pos = joint_pos + step
         return torch.stack(actions, dim=-2)
 
     def tool_target(self, goal: Tensor) -> tuple[Tensor, Tensor]:
@@ -136,8 +166,8 @@ def way_to(tool: Tensor, target: Tensor, on_table: Tensor, approach: Approach, b
     """Displacement that a tool has still to make, ``(*B, 3)`` [m], as a velocity direction at ``tool``.
 
     Sideways the way is taken in polar coordinates about the arm's axis (out of its own way, pan and reach at once).
-    A goal on the table is approached at the travel height; the box drops within the drop distance, and a box that is
-    low lifts before it moves.
+    A goal on the table is approached at the travel height; the box drops within the drop distance, and a box more
+    than 2 cm below the clear height lifts before it moves.
 
     Args:
         tool: ``(*B, 3)`` [m], base frame.

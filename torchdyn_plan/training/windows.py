@@ -11,6 +11,7 @@ from torch import Tensor
 
 from torchdyn_plan.checks import check_number
 from torchdyn_plan.errors import InputError
+from torchdyn_plan.training.lines import Lines
 
 
 class Paths(NamedTuple):
@@ -34,7 +35,9 @@ class Windows(NamedTuple):
     history_length: Tensor
     """(*B,) int64 rows of the history that are no padding."""
     future: Tensor
-    """(*B, F, 3) [m, world]."""
+    """(*B, F, 3) [m, world], or on the unfolded line if that was asked for."""
+    recorded: Tensor
+    """(*B, F) bool: false after the target was swallowed, where the future repeats its last position."""
     pocketed: Tensor
     """(*B,) bool: the target is swallowed within the window."""
     moving: Tensor
@@ -108,7 +111,13 @@ def last_useful_step(paths: Paths, config: WindowConfig) -> Tensor:
 
 
 def draw_windows(
-    paths: Paths, last_step: Tensor, episodes: Tensor, config: WindowConfig, generator: torch.Generator
+    paths: Paths,
+    last_step: Tensor,
+    episodes: Tensor,
+    config: WindowConfig,
+    generator: torch.Generator,
+    *,
+    lines: Lines | None = None,
 ) -> Windows:
     """One random window of each of ``episodes`` (M,), whose presents may run to ``last_step`` (E,)."""
     shape = episodes.shape
@@ -120,17 +129,29 @@ def draw_windows(
     shortest = min(config.first_step, config.history)
     shortened = shortest + (cut * (config.history - shortest + 1)).long()
     seen = torch.where(kind < config.shortened_share, shortened, config.history)
-    return cut_windows(paths, episodes, present, torch.minimum(seen, present), config)
+    return cut_windows(paths, episodes, present, torch.minimum(seen, present), config, lines=lines)
 
 
-def cut_windows(paths: Paths, episodes: Tensor, present: Tensor, seen: Tensor, config: WindowConfig) -> Windows:
-    """Windows at steps ``present`` (M,) of ``episodes`` (M,), of whose history ``seen`` (M,) rows are no padding."""
-    offset = torch.arange(1 - config.history, config.horizon + 1)
-    step = (present.unsqueeze(-1) + offset).clamp(min=(present - seen).unsqueeze(-1))
+def cut_windows(
+    paths: Paths, episodes: Tensor, present: Tensor, seen: Tensor, config: WindowConfig, *, lines: Lines | None = None
+) -> Windows:
+    """Windows at steps ``present`` (M,) of ``episodes`` (M,), of whose history ``seen`` (M,) rows are no padding.
+
+    With ``lines`` the futures are the unfolded ones, as continued from the stretch of table that the target is on.
+    """
     last = paths.length[episodes] - 1
-    index = paths.start[episodes].unsqueeze(-1) + torch.minimum(step, last.unsqueeze(-1))
-    track = paths.positions[index]
-    history, future = track[..., : config.history, :], track[..., config.history :, :]
+    first, now = paths.start[episodes], paths.start[episodes] + present
+    behind = torch.arange(1 - config.history, 1) + present.unsqueeze(-1)
+    oldest = (present - seen).unsqueeze(-1)
+    history = paths.positions[first.unsqueeze(-1) + torch.maximum(behind, oldest)]
+    ahead = torch.arange(1, config.horizon + 1) + present.unsqueeze(-1)
+    recorded = ahead <= last.unsqueeze(-1)
+    index = first.unsqueeze(-1) + torch.minimum(ahead, last.unsqueeze(-1))
+    if lines is None:
+        future = paths.positions[index]
+    else:
+        future = lines.track[index]
+        future[..., :2] = (future[..., :2] - lines.shift[now].unsqueeze(-2)) * lines.side[now].unsqueeze(-2)
     moving = (history[..., -1, :] - history[..., -2, :]).norm(dim=-1) > config.still_speed
     pocketed = paths.pocketed[episodes] & (last <= present + config.horizon)
-    return Windows(history, seen.clamp(max=config.history), future, pocketed, moving)
+    return Windows(history, seen.clamp(max=config.history), future, recorded, pocketed, moving)

@@ -1,0 +1,119 @@
+import pytest
+import torch
+
+from torchdyn_plan.errors import InputError
+from torchdyn_plan.nets import ETAConfig, ETANetwork
+from torchdyn_plan.nets.eta import arrival_classes, decode_expectation, decode_mode
+
+
+@pytest.fixture
+def network():
+    torch.manual_seed(0)
+    return ETANetwork(hidden=16).double().eval()
+
+
+def samples(*batch):
+    draw = torch.Generator().manual_seed(0)
+    rand = lambda size: torch.rand(*batch, size, generator=draw, dtype=torch.float64)  # noqa: E731
+    return rand(15), rand(3)
+
+
+@pytest.mark.parametrize("batch", [(), (4,), (2, 3)])
+def test_batch_is_free_and_equals_a_loop(network, batch):
+    state, goal = samples(*batch)
+    logits = network(state, goal)
+    assert logits.shape == (*batch, 101)
+    rows = [network(s, g) for s, g in zip(state.reshape(-1, 15), goal.reshape(-1, 3), strict=True)]
+    torch.testing.assert_close(logits.reshape(-1, 101), torch.stack(rows))
+
+
+def test_one_state_serves_many_goals(network):
+    state, _ = samples(2)
+    goal = torch.rand(2, 4, 3, dtype=torch.float64)
+    logits = network(state.unsqueeze(1), goal)
+    assert logits.shape == (2, 4, 101)
+    torch.testing.assert_close(logits, network(state.unsqueeze(1).expand(-1, 4, -1), goal))
+
+
+def test_gradient_is_right_and_finite_at_the_tool(network):
+    state, goal = samples(2)
+    assert torch.autograd.gradcheck(lambda s, g: network(s, g)[:, ::9], (state.requires_grad_(), goal.requires_grad_()))
+    at_tool = state[:, 12:].detach().requires_grad_()
+    network(state, at_tool).sum().backward()
+    assert bool(at_tool.grad.isfinite().all())
+
+
+def test_statistics_standardise_the_inputs(network):
+    state, goal = samples(500)
+    state = state * 7 + 3
+    network.set_input_statistics(state, goal)
+    seen = (state - network.state_offset) * network.state_scale
+    torch.testing.assert_close(seen.mean(0), torch.zeros(15, dtype=torch.float64), atol=1e-9, rtol=0)
+    torch.testing.assert_close(seen.std(0), torch.ones(15, dtype=torch.float64))
+
+
+def test_mode_is_the_middle_of_the_likeliest_bin():
+    logits = torch.full((101, 101), -9.0).fill_diagonal_(9.0)
+    steps, never = decode_mode(logits)
+    assert steps[:100].tolist() == [5 * k + 2 for k in range(100)]
+    assert never.tolist() == [False] * 100 + [True]
+
+
+def test_expectation_lies_between_bins_and_never_is_a_majority():
+    shares = torch.zeros(3, 101)
+    shares[0, [4, 5]] = torch.tensor([0.25, 0.75])
+    shares[1, [4, 100]] = torch.tensor([0.45, 0.55])
+    shares[2, [4, 9, 100]] = torch.tensor([0.3, 0.3, 0.4])
+    steps, never = decode_expectation(shares.log())
+    assert steps.tolist() == pytest.approx([22 + 0.75 * 5, 22, (22 + 47) / 2])
+    assert never.tolist() == [False, True, False]
+
+
+def test_targets_are_unbiased_and_hold_their_bin():
+    arrival = torch.arange(500)
+    classes, holding = arrival_classes(arrival)
+    assert classes.shape == (500, 101)
+    torch.testing.assert_close(classes.sum(-1), torch.ones(500))
+    assert bool(((classes > 0).sum(-1) <= 2).all())
+    assert torch.equal(classes.argmax(-1), holding)
+    assert torch.equal(holding, arrival // 5)
+    steps, never = decode_expectation(classes.log())
+    # The outer halves of the first and the last bin have no neighbour to lean on.
+    torch.testing.assert_close(steps, arrival.clamp(2, 497).float(), atol=1e-3, rtol=0)
+    assert not never.any()
+
+
+def test_targets_of_never():
+    classes, holding = arrival_classes(torch.tensor([-1, 500, 12, 1200]))
+    assert holding.tolist() == [100, 100, 2, 100]
+    assert classes[:, 100].tolist() == [1.0, 1.0, 0.0, 1.0]
+    assert classes.sum().item() == 4.0
+
+
+def test_targets_with_bins_of_one_step():
+    classes, holding = arrival_classes(torch.arange(-1, 7), bins=6, bin_width=1)
+    assert holding.tolist() == [6, 0, 1, 2, 3, 4, 5, 6]
+    assert torch.equal(classes, torch.eye(7)[holding])
+
+
+@pytest.mark.parametrize("reading", ["mode", "expectation"])
+def test_arrival_reads_the_logits(network, reading):
+    state, goal = samples(8)
+    arrival = network.arrival(state, goal, reading=reading)
+    expected = {"mode": decode_mode, "expectation": decode_expectation}[reading](network(state, goal))
+    assert torch.equal(arrival.steps, expected.steps)
+    assert torch.equal(arrival.never, expected.never)
+
+
+def test_wrong_inputs_are_named(network):
+    state, goal = samples(2)
+    with pytest.raises(InputError, match=r"robot_state.*15.*\(2, 14\)"):
+        network(state[:, :14], goal)
+    with pytest.raises(InputError, match=r"goal.*\(2, 2\)"):
+        network(state, goal[:, :2])
+    with pytest.raises(InputError, match="goal must be finite"):
+        network(state, goal * float("nan"))
+    with pytest.raises(InputError, match="expectation"):
+        network.arrival(state, goal, reading="expectaton")
+    with pytest.raises(InputError, match=r"tool_slice.*\(13, 16\)"):
+        ETAConfig(tool_slice=(13, 16))

@@ -1,0 +1,100 @@
+import pytest
+import torch
+
+from torchdyn_plan.nets.eta import arrival_classes
+from torchdyn_plan.training.metrics import arrival_errors, arrival_groups, forecast_errors, pocket_accuracy
+from torchdyn_plan.training.windows import Windows
+
+
+def windows_of(n=5):
+    """Targets on straight lines along x, 0.01 m a step: full, full, padded, pocketed at 50 steps, still."""
+    step = torch.tensor([0.01, 0.002, 0.01, 0.01, 0.0]).view(n, 1, 1) * torch.tensor([1.0, 0.0, 0.0])
+    history = step * torch.arange(-23.0, 1.0).view(1, -1, 1)
+    future = step * torch.arange(1.0, 301.0).view(1, -1, 1)
+    recorded = torch.ones(n, 300, dtype=torch.bool)
+    recorded[3, 50:] = False
+    flags = torch.tensor([False, False, False, True, False])
+    future[3, 50:, 2] = -0.05
+    moving = torch.tensor([True, True, True, True, False])
+    return Windows(history, torch.tensor([24, 24, 13, 24, 24]), future, recorded, flags, moving)
+
+
+def by(rows, *names):
+    return {tuple(row[name] for name in names): row for row in rows}
+
+
+def test_forecast_errors_by_hand():
+    windows = windows_of()
+    forecast = windows.future + torch.tensor([0.3, 0.4, 0.0]) * torch.tensor([1.0, 2.0, 4.0, 8.0, 16.0]).view(5, 1, 1)
+    rows = by(forecast_errors(forecast, windows), "windows", "ahead")
+    assert rows["full", 25]["count"] == rows["full", 300]["count"] == 2
+    assert rows["full", 300]["median"] == pytest.approx(0.5)
+    assert rows["full", 300]["mean"] == pytest.approx(0.75)
+    assert rows["full", 300]["constant_velocity"] == pytest.approx(0.0, abs=1e-5)
+    assert rows["padded", 100]["mean"] == pytest.approx(2.0)
+    assert rows["fast", 100]["count"] == 2
+    assert rows["pocketed", 25]["mean"] == pytest.approx(4.0)
+    assert rows["pocketed", 100] == rows["pocketed", 100] | {"count": 0, "median": None, "mean": None}
+    assert rows["still", 300]["mean"] == pytest.approx(8.0)
+
+
+def test_constant_velocity_goes_on_as_in_the_last_step():
+    windows = windows_of()
+    windows.future[:, :, 1] += 0.2
+    rows = by(forecast_errors(windows.future, windows), "windows", "ahead")
+    assert rows["full", 100]["constant_velocity"] == pytest.approx(0.2, abs=1e-5)
+    assert rows["full", 100]["median"] == 0.0
+
+
+def test_short_horizons_are_scored_as_far_as_they_go():
+    windows = windows_of()
+    short = windows._replace(future=windows.future[:, :120], recorded=windows.recorded[:, :120])
+    assert {row["ahead"] for row in forecast_errors(short.future, short)} == {25, 100}
+
+
+def test_pocket_accuracy_by_hand():
+    windows = windows_of()
+    assert pocket_accuracy(windows.future, windows) == {"count": 4, "pocketed": 0.25, "found": 1.0, "false": 0.0}
+    wrong = windows.future.clone()
+    wrong[..., 2] *= -1
+    wrong[0, -1, 2] = -1.0
+    assert pocket_accuracy(wrong, windows)["found"] == 0.0
+    assert pocket_accuracy(wrong, windows)["false"] == pytest.approx(1 / 3)
+
+
+def test_arrival_errors_by_hand():
+    arrival = torch.tensor([2, 7, 102, -1, -1, 900])
+    logits = 20 * torch.nn.functional.one_hot(torch.tensor([0, 3, 20, 100, 5, 100]), 101).double()
+    everything = torch.ones(6, dtype=torch.bool)
+    rows = by(arrival_errors(logits, arrival, {"all": everything, "none": ~everything}), "samples", "reading")
+    mode = rows["all", "mode"]
+    assert (mode["count"], mode["mean"], mode["p95"]) == (3, pytest.approx(10 / 3), 10.0)
+    assert mode["bias"] == pytest.approx(10 / 3)
+    assert mode["never_accuracy"] == pytest.approx(5 / 6)
+    assert rows["all", "expectation"]["mean"] == pytest.approx(10 / 3, abs=1e-2)
+    assert rows["none", "mode"]["mean"] is None
+    assert rows["none", "mode"]["never_accuracy"] is None
+
+
+def test_expectation_of_perfect_targets_has_no_error_and_no_bias():
+    arrival = torch.arange(2, 498)
+    logits = arrival_classes(arrival)[0].log()
+    everything = {"all": torch.ones(496, dtype=torch.bool)}
+    rows = by(arrival_errors(logits, arrival, everything), "reading")
+    assert rows[("expectation",)]["mean"] < 1e-3
+    assert rows[("mode",)]["mean"] == pytest.approx(1.2, abs=0.01)
+
+
+def test_arrival_groups_by_hand():
+    state = torch.zeros(3, 15)
+    state[1, 7], state[2, 0] = -1.0, 5.0
+    goal = torch.tensor([[0.0, 0.0, 0.03], [0.0, 0.0, 0.2], [0.0, 0.0, 0.047]])
+    groups = arrival_groups(state, goal, torch.tensor([29, 30, -1]), table_goal=0.047)
+    assert {name: mask.tolist() for name, mask in groups.items()} == {
+        "all": [True, True, True],
+        "soon": [True, False, False],
+        "on table": [True, False, True],
+        "above table": [False, True, False],
+        "at rest": [True, False, True],
+        "in motion": [False, True, False],
+    }

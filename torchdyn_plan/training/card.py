@@ -1,0 +1,64 @@
+"""The card beside a network: what it was made with and how well it does."""
+
+import json
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+from torchdyn_plan.errors import InputError
+from torchdyn_plan.files import write_whole
+from torchdyn_plan.versions import library_versions, machine
+
+
+def read_description(data: Path, stem: str, *, scene: str) -> dict[str, Any]:
+    """What ``data`` says of its ``stem-*.safetensors``: arguments of each collection, and the scene's digest.
+
+    Args:
+        data: folder of `torchdyn_plan.training.collect`.
+        stem: ``paths`` or ``arrivals``.
+        scene: digest of the scene that the data must come from.
+
+    Raises:
+        InputError: there is no description, it is broken, or it tells of another scene.
+    """
+    files = sorted(Path(data).glob(f"{stem}-*.json"))
+    if not files:
+        raise InputError(f"no {stem}-*.json in {str(data)!r}: its collection did not finish")
+    arguments = []
+    for file in files:
+        try:
+            about = json.loads(file.read_text())
+            arguments.append(about["arguments"])
+            found = about["scene"]
+        except (OSError, ValueError, KeyError, TypeError) as error:
+            raise InputError(f"{str(file)!r} is no description of collected data: {error!r}") from error
+        if found != scene:
+            raise InputError(f"{str(file)!r} tells of scene {found}, but the scene is {scene}: collect the data anew")
+    return {"arguments": arguments, "scene": scene}
+
+
+def write_card(
+    file: Path, title: str, facts: Mapping[str, Any], tables: Mapping[str, Sequence[Mapping[str, Any]]]
+) -> None:
+    """Write ``file`` as Markdown: a list of ``facts``, versions and machine, then a table for each of ``tables``."""
+    facts = dict(facts) | {"versions": library_versions(), "machine": machine()}
+    lines = [f"# {title}", ""]
+    lines += [f"- {name}: {_plain(value)}" for name, value in facts.items()]
+    for caption, rows in tables.items():
+        lines += ["", f"## {caption}", "", *_table(rows)]
+    write_whole(file, lambda temporary: temporary.write_text("\n".join(lines) + "\n"))
+
+
+def _plain(value: Any) -> str:
+    if isinstance(value, Mapping):
+        return ", ".join(f"{name} {_plain(entry)}" for name, entry in value.items())
+    if isinstance(value, list):
+        return "; ".join(_plain(entry) for entry in value)
+    return f"{value:.4g}" if isinstance(value, float) else str(value)
+
+
+def _table(rows: Sequence[Mapping[str, Any]]) -> list[str]:
+    names = list(rows[0])
+    lines = [names, ["---"] * len(names)]
+    lines += [["–" if row[name] is None else _plain(row[name]) for name in names] for row in rows]
+    return [f"| {' | '.join(line)} |" for line in lines]
