@@ -30,21 +30,21 @@ class TrapperScene:
     """[m]"""
     pocket_gap: float = 0.22
     """Free width of a pocket between two rail segments [m]."""
-    pocket_offset: float = 0.395
+    pocket_offset: float = 0.42
     """Distance of a pocket's middle from the middle of its wall [m]."""
-    ball_radius: float = 0.037
+    ball_radius: float = 0.042
     """[m]"""
-    ball_mass: float = 4.05
+    ball_mass: float = 6.0
     """[kg]"""
     rolling_resistance: float = 0.0001
     """Lever arm of the cloth's resistance to rolling [m]; deceleration is 5/7·g·lever/radius."""
-    cloth_friction: float = 0.1
+    cloth_friction: float = 0.085
     """Sliding friction coefficient of ball on cloth."""
     cushion_stiffness: float = 100000.0
     """Stiffness of a cushion per effective mass [1/s²]."""
     cushion_damping: float = 10.0
     """Damping of a cushion per effective mass [1/s]."""
-    box_half_width: float = 0.06
+    box_half_width: float = 0.065
     """Inner half-width of the box [m]."""
     box_wall: float = 0.004
     """[m]"""
@@ -62,8 +62,10 @@ class TrapperScene:
     """Position gain of each joint [N·m/rad]."""
     servo_damping: tuple[float, ...] = (400.0, 400.0, 300.0, 60.0, 60.0, 60.0)
     """Speed gain of each joint [N·m·s/rad]."""
-    acceleration_limit: float = 150.0
+    acceleration_limit: float = 75.0
     """Greatest change of a commanded joint speed [rad/s²]."""
+    servo_speed: float = 0.95
+    """Greatest speed that a servo strives for, as a share of the joint's limit: what the others' motion adds needs room."""
     substep: float = 0.002
     """Physics step [s]."""
     control_step: float = 0.004

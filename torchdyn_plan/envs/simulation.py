@@ -66,15 +66,16 @@ class TrapperSimulation:
         self.batch.step(None if rows is None else rows.numpy(), nstep=self.substeps)
 
     def _drive(self, action: Tensor) -> None:
-        wanted = action.to(torch.float64).clamp(-1.0, 1.0) * UR5_SPEED_LIMIT
+        fastest = self.scene.servo_speed * UR5_SPEED_LIMIT
+        wanted = (action.to(torch.float64) * UR5_SPEED_LIMIT).clamp(-fastest, fastest)
         change = self.scene.acceleration_limit * self.scene.control_step
         speed = torch.clamp(wanted, self._speed - change, self._speed + change, out=self._speed)
         position = self.joint_pos
         self._command += speed * self.scene.control_step
         self._command.clamp_(position - self.LEASH, position + self.LEASH)
         self._command.clamp_(*self._range)
-        # The speed that the servo strives for, speed + (k/d)·(command - position), never exceeds the joint's limit.
-        fastest = self._lead * UR5_SPEED_LIMIT
-        torch.clamp(self._command + self._lead * speed, position - fastest, position + fastest, out=self._ctrl)
+        # The speed that the servo strives for, speed + (k/d)·(command - position), never exceeds the fastest.
+        ahead = self._lead * fastest
+        torch.clamp(self._command + self._lead * speed, position - ahead, position + ahead, out=self._ctrl)
 
 

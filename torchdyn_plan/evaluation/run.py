@@ -58,11 +58,11 @@ def run_points(arguments: EvaluateArguments) -> dict[str, EpisodeOutcomes]:
     """Outcomes of the same episodes for each planner that ``arguments`` name."""
     with _one_thread():
         planners = {name: PLANNERS[name](arguments.static) for name in arguments.planners}
-        future, solvable = _truth(arguments)
+        future, solvable = record_truth(arguments)
         return {name: run_episodes(planner, arguments, future, solvable, name) for name, planner in planners.items()}
 
 
-def _truth(arguments: EvaluateArguments) -> tuple[Tensor, Tensor]:
+def record_truth(arguments: EvaluateArguments) -> tuple[Tensor, Tensor]:
     """Recorded future ``(E, T, 3)`` of every episode's ball, and which episodes are solvable ``(E,)``."""
     scene, threads = TrapperScene(), arguments.threads
     arrivals = arrival_map(arguments.static, STATICS[arguments.static](), scene, num_threads=threads)

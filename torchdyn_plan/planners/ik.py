@@ -29,17 +29,17 @@ class Approach:
     """Position of the arm's base frame in the world, axes parallel [m]."""
     tool_length: float = 0.084
     """Distance of the box mouth from the flange [m]."""
-    table_height: float = 0.047
+    table_height: float = 0.052
     """Goals at or below this height are on the table: the box is dropped over them [m]."""
     down_height: float = 0.006
     """Height of the box mouth when it is down [m]."""
-    travel_height: float = 0.089
+    travel_height: float = 0.099
     """Height of the box mouth on its way to a goal on the table, above the ball [m]."""
-    clear_height: float = 0.079
+    clear_height: float = 0.089
     """Below this the box slows sideways as it lifts, and 2 cm below it stands still sideways [m]."""
-    drop_distance: float = 0.025
+    drop_distance: float = 0.045
     """Horizontal distance from the goal within which the box drops [m]."""
-    half_extent: float = 0.722
+    half_extent: float = 0.717
     """The tool's place is clamped to the square of this half-side, which keeps the box clear of the rails [m]."""
     min_radius: float = 0.2
     """The tool keeps at least this distance from the arm's vertical axis [m]."""
