@@ -22,7 +22,7 @@ GRAVITY = 9.81
 class TrapperScene:
     """Geometry and physics of Trapper. Frame: z up, table surface at z = 0, table centre at the origin, arm at -y."""
 
-    table_side: float = 1.58
+    table_side: float = 1.59
     """Side of the square playing area, from cushion to cushion [m]."""
     rail_width: float = 0.12
     """[m]"""
@@ -38,7 +38,7 @@ class TrapperScene:
     """[kg]"""
     rolling_resistance: float = 0.0001
     """Lever arm of the cloth's resistance to rolling [m]; deceleration is 5/7·g·lever/radius."""
-    cloth_friction: float = 0.085
+    cloth_friction: float = 0.065
     """Sliding friction coefficient of ball on cloth."""
     cushion_stiffness: float = 100000.0
     """Stiffness of a cushion per effective mass [1/s²]."""

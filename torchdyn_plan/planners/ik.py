@@ -25,7 +25,7 @@ PATH_NAMES = ("path", "path_step", "path_goal")
 class Approach:
     """How goals become tool positions: where the table is, how high to travel, where the box may stand."""
 
-    base_pos: tuple[float, float, float] = (0.0, -0.85, 0.05)
+    base_pos: tuple[float, float, float] = (0.0, -0.855, 0.05)
     """Position of the arm's base frame in the world, axes parallel [m]."""
     tool_length: float = 0.084
     """Distance of the box mouth from the flange [m]."""
@@ -39,7 +39,7 @@ class Approach:
     """Below this the box slows sideways as it lifts, and 2 cm below it stands still sideways [m]."""
     drop_distance: float = 0.045
     """Horizontal distance from the goal within which the box drops [m]."""
-    half_extent: float = 0.717
+    half_extent: float = 0.722
     """The tool's place is clamped to the square of this half-side, which keeps the box clear of the rails [m]."""
     min_radius: float = 0.2
     """The tool keeps at least this distance from the arm's vertical axis [m]."""
