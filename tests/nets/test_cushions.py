@@ -1,7 +1,7 @@
 import pytest
 import torch
 
-from torchdyn_plan.nets.cushions import fold, unfold
+from torchdyn_plan.nets.cushions import fold
 
 
 @pytest.mark.parametrize(
@@ -17,15 +17,6 @@ def test_fold_is_odd_periodic_and_inside():
     assert folded.abs().max() <= 0.7 + 1e-12
     torch.testing.assert_close(fold(-line, 0.7), -folded)
     torch.testing.assert_close(fold(line + 2.8, 0.7), folded)
-
-
-def test_unfold_inverts_fold_between_mirrors():
-    start, velocity = torch.tensor([[0.1, -0.3], [0.5, 0.2]]), torch.tensor([[0.0171, -0.0093], [-0.0043, 0.0131]])
-    line = start.unsqueeze(1) + torch.arange(400).view(1, -1, 1) * velocity.unsqueeze(1)
-    path = fold(line.double(), 0.75)
-    torch.testing.assert_close(fold(unfold(path, 0.75), 0.75), path)
-    # A sampled bounce is placed to within the steps beside it.
-    assert (unfold(path, 0.75) - line).abs().max() < 2 * 0.0171
 
 
 def test_fold_has_unit_slope():

@@ -38,12 +38,14 @@ class ReachingTask:
         self._memory: TensorDict | None = None
         self.reset()
 
-    def reset(self) -> None:
-        """Put every arm back home, at rest, without a memory."""
+    def reset(self, joint_pos: Tensor | None = None, joint_vel: Tensor | None = None) -> None:
+        """Put every arm home, at rest, or where it is told, (N, 6) [rad] and [rad/s]; all without a memory."""
         count = self.simulation.num_envs
         far = torch.tensor([0.0, self.scene.half_side - 2 * self.scene.ball_radius], dtype=torch.float64)
         still = torch.zeros(count, 2, dtype=torch.float64)
         self.simulation.reset(torch.arange(count), far.expand(count, 2), still)
+        if joint_pos is not None and joint_vel is not None:
+            self.simulation.place_arms(joint_pos, joint_vel)
         self._memory, self._steps = None, torch.zeros(count, dtype=torch.int64)
 
     @property

@@ -59,6 +59,11 @@ class TrapperSimulation:
             self._command[rows], self._speed[rows] = self._home, 0.0
             self._ctrl[rows] = self._home
 
+    def place_arms(self, joint_pos: Tensor, joint_vel: Tensor) -> None:
+        """Put every arm at ``joint_pos`` (N, 6) [rad], moving with ``joint_vel`` (N, 6) [rad/s] as if so commanded."""
+        self.joint_pos[:], self.joint_vel[:] = joint_pos, joint_vel
+        self._command[:], self._speed[:] = joint_pos, joint_vel
+
     def step(self, action: Tensor | None = None, rows: Tensor | None = None) -> None:
         """One control step of ``rows`` (all by default); ``action`` (N, 6) is joint speed over its limit, -1 to 1."""
         if action is not None:

@@ -28,10 +28,12 @@ FASTEST = 5.0
 """Balls start with velocities up to this [m/s]."""
 STATES_PER_RUN = 5
 """Intermediate states taken from each run of the static planner (paper, Section III-B.3)."""
-RUN_STEPS = 300
+RUN_STEPS = 260
 """Control steps that a run may take after its goal was given."""
-SWITCH_STEPS = 80
-"""The goal of a run is given within this many steps of another motion."""
+SWITCH_STEPS = 150
+"""The goal of a run is given within this many steps of another motion that starts at home."""
+AT_HOME = 0.15
+"""Share of runs whose goal is given at home, at rest."""
 STATIC_PLANNERS: dict[str, Callable[[], Callable[[TensorDictBase], TensorDictBase]]] = {"ik": IKPlanner}
 
 
@@ -100,7 +102,7 @@ def _flatten(paths: Tensor, speeds: Tensor, scene: TrapperScene) -> dict[str, Te
 
 
 def _arrivals(arguments: CollectArguments, scene: TrapperScene, index: int) -> dict[str, Tensor]:
-    """Runs of the static planner from wherever the last ones ended, each redirected once in mid-motion."""
+    """Runs of the static planner from home, most of them redirected on their way somewhere else or when they are there."""
     task = ReachingTask(
         STATIC_PLANNERS[arguments.static](), arguments.num_envs, scene=scene, num_threads=arguments.threads
     )
@@ -116,9 +118,11 @@ def _arrivals(arguments: CollectArguments, scene: TrapperScene, index: int) -> d
 
 def _run(task: ReachingTask, draw: torch.Generator) -> dict[str, Tensor]:
     """One run of every arm: `STATES_PER_RUN` states each, with their goals and the steps that were left to arrival."""
+    task.reset()
     count = task.simulation.num_envs
     before, goal = draw_goals(task.scene, count, draw), draw_goals(task.scene, count, draw)
     given = torch.randint(SWITCH_STEPS, (count,), generator=draw)
+    given[torch.rand(count, generator=draw) < AT_HOME] = 0
     states = torch.empty(SWITCH_STEPS + RUN_STEPS + 1, count, task.robot_state.shape[-1])
     arrived = torch.full((count,), -1)
     for step in range(SWITCH_STEPS + RUN_STEPS + 1):
