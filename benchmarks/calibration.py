@@ -1,6 +1,6 @@
 """How the Trapper scene compares with the paper: solvable shares and target pursuit, which hardly depend on planning.
 
-    python benchmarks/calibration.py --out benchmarks/results/calibration.json
+python benchmarks/calibration.py --out benchmarks/results/calibration.json
 """
 
 import dataclasses
@@ -74,7 +74,9 @@ def _row(
     share = rate(count, arguments.episodes)
     row = {"what": what, "velocity": velocity, "friction": friction, "episodes": arguments.episodes}
     row |= {"ours": share.value, "ci": [share.low, share.high], "paper": paper, "difference": share.value - paper}
-    print(f"{what:9} {velocity:g} m/s, {friction:g} N: {share.value:.3f}  paper {paper:.2f} ({share.value - paper:+.3f})")
+    print(
+        f"{what:9} {velocity:g} m/s {friction:g} N: {share.value:.3f}, paper {paper:.2f} ({share.value - paper:+.3f})"
+    )
     return row
 
 

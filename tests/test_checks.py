@@ -21,7 +21,7 @@ def test_trailing_shape_names_both_shapes(shape):
 
 
 def test_trailing_shape_wants_a_tensor():
-    with pytest.raises(InputError, match="history must be a torch.Tensor, got list"):
+    with pytest.raises(InputError, match=r"history must be a torch\.Tensor, got list"):
         checks.check_trailing_shape("history", [0.0], 1)  # pyright: ignore[reportArgumentType]
 
 

@@ -11,7 +11,7 @@ import torchdyn_plan
 ROOT = Path(torchdyn_plan.__file__).parent
 WORDS = {"errors", "checks", "files", "keys"}
 MAY_IMPORT = {
-    **{word: WORDS for word in sorted(WORDS)},
+    **dict.fromkeys(sorted(WORDS), WORDS),
     "versions": set(),
     "kinematics": WORDS,
     "nets": WORDS | {"kinematics"},

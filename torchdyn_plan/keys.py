@@ -52,7 +52,7 @@ KEYS: tuple[Key, ...] = (
     Key(name=GOAL, shape=(3,), meaning="place the static planner is sent to [m, world]", writer="planner"),
     Key(name=ARRIVAL_STEPS, shape=(), meaning="control steps from now to the meeting", writer="planner"),
     Key(name=ACTION, shape=("A",), meaning="joint speed as a fraction of the limit, -1 to 1", writer="static planner"),
-    Key(name=TARGET_FUTURE, shape=("F", 3), meaning="recorded truth, for the oracle alone [m, world]", writer="evaluation"),
+    Key(name=TARGET_FUTURE, shape=("F", 3), meaning="recorded truth, for the oracle [m, world]", writer="evaluation"),
     Key(name=PLAN, shape=(), meaning="the planner's memory between steps (nested)", writer="planner"),
 )
 """Every shared key. Further entries below ``plan`` belong to the planner that wrote them."""

@@ -1,3 +1,4 @@
+# pyright: reportAttributeAccessIssue=false -- mujoco hides its names from type checkers
 """The Trapper scene: a UR5 with a box, a billiard table with eight pockets, and a ball, from one frozen dataclass."""
 
 import dataclasses
@@ -65,7 +66,7 @@ class TrapperScene:
     acceleration_limit: float = 75.0
     """Greatest change of a commanded joint speed [rad/s²]."""
     servo_speed: float = 0.95
-    """Greatest speed that a servo strives for, as a share of the joint's limit: what the others' motion adds needs room."""
+    """Greatest speed that a servo strives for, as a share of the joint's limit; the other joints add to it."""
     substep: float = 0.002
     """Physics step [s]."""
     control_step: float = 0.004

@@ -12,6 +12,7 @@ from torchdyn_plan.kinematics.ur5 import UR5_LINKS, UR5_SPEED_LIMIT
 class TrapperSimulation:
     """Arms, balls and servos of ``num_envs`` scenes. All tensors are float64 on the CPU.
 
+    ``qpos`` (N, nq) holds MuJoCo's generalised positions, from which a scene can be drawn.
     ``joint_pos``, ``joint_vel`` (N, 6) [rad, rad/s] and ``ball_pos``, ``ball_vel`` (N, 3) [m, m/s, world] are views of
     the simulation: they change with every step, without copies.
     """
@@ -27,17 +28,17 @@ class TrapperSimulation:
         self.model = scene.compile(arm=arm, friction=friction)
         self.batch = Batch(self.model, num_envs, num_threads, True)
         self.substeps = round(scene.control_step / scene.substep)
-        self._qpos = torch.from_numpy(self.batch.bind("qpos"))
+        self.qpos = torch.from_numpy(self.batch.bind("qpos"))
         self._qvel = torch.from_numpy(self.batch.bind("qvel"))
         ball = self.model.joint("ball")
         q, v = int(ball.qposadr[0]), int(ball.dofadr[0])
-        self.ball_pos, self._ball_turn = self._qpos[:, q : q + 3], self._qpos[:, q + 3 : q + 7]
+        self.ball_pos, self._ball_turn = self.qpos[:, q : q + 3], self.qpos[:, q + 3 : q + 7]
         self.ball_vel, self.ball_spin = self._qvel[:, v : v + 3], self._qvel[:, v + 3 : v + 6]
         self.has_arm = arm
         if arm:
             first = self.model.joint(UR5_LINKS[0].joint)
             q, v = int(first.qposadr[0]), int(first.dofadr[0])
-            self.joint_pos, self.joint_vel = self._qpos[:, q : q + 6], self._qvel[:, v : v + 6]
+            self.joint_pos, self.joint_vel = self.qpos[:, q : q + 6], self._qvel[:, v : v + 6]
             self._ctrl = torch.from_numpy(self.batch.bind("ctrl"))
             self._home = torch.tensor(scene.home, dtype=torch.float64)
             self._command, self._speed = self._home.repeat(num_envs, 1), torch.zeros_like(self.joint_pos)
@@ -82,5 +83,3 @@ class TrapperSimulation:
         # The speed that the servo strives for, speed + (k/d)·(command - position), never exceeds the fastest.
         ahead = self._lead * fastest
         torch.clamp(self._command + self._lead * speed, position - ahead, position + ahead, out=self._ctrl)
-
-

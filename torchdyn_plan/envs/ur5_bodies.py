@@ -1,3 +1,4 @@
+# pyright: reportAttributeAccessIssue=false -- mujoco hides its names from type checkers
 """The UR5 as MuJoCo bodies, made from the same table as its kinematic chain."""
 
 import math
@@ -12,6 +13,7 @@ SILVER = (0.73, 0.75, 0.77, 1.0)
 BLUE = (0.33, 0.53, 0.70, 1.0)
 ARMATURE = 0.1
 """Inertia of a motor behind its gear [kg·m²], as in MuJoCo Menagerie's UR models."""
+
 
 @dataclass(frozen=True)
 class Shell:

@@ -33,7 +33,7 @@ class MeasuredArrival(nn.Module):
         self.static, self.scene, self.num_threads = static, scene or TrapperScene(), num_threads
         self._tasks: dict[int, ReachingTask] = {}
 
-    def arrival(self, robot_state: Tensor, goal: Tensor, *, reading: Any = None) -> Arrival:  # noqa: ARG002
+    def arrival(self, robot_state: Tensor, goal: Tensor, *, reading: Any = None) -> Arrival:
         """Steps and *never* (*B, K) for robot states (*B, 1, 15) and goals (*B, K, 3) [m, world]; nothing to read."""
         check_trailing_shape("robot_state", robot_state, 15)
         check_trailing_shape("goal", goal, 3)

@@ -17,4 +17,3 @@ def fold(unfolded: Tensor, half_extent: float) -> Tensor:
     branch = torch.round(unfolded / (2 * half_extent))
     inside = unfolded - 2 * half_extent * branch
     return torch.where(branch % 2 == 0, inside, -inside)
-

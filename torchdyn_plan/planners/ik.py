@@ -41,7 +41,7 @@ class Approach:
     """Horizontal distance from the goal within which the box drops [m]."""
     half_extent: float = 0.722
     """The tool's place is clamped to the square of this half-side, which keeps the box clear of the rails [m]."""
-    min_radius: float = 0.2
+    min_radius: float = 0.1
     """The tool keeps at least this distance from the arm's vertical axis [m]."""
     max_radius: float = 0.91
     """The tool keeps at most this distance from the arm's vertical axis [m]."""

@@ -28,9 +28,9 @@ FASTEST = 5.0
 """Balls start with velocities up to this [m/s]."""
 STATES_PER_RUN = 5
 """Intermediate states taken from each run of the static planner (paper, Section III-B.3)."""
-RUN_STEPS = 260
+RUN_STEPS = 220
 """Control steps that a run may take after its goal was given."""
-SWITCH_STEPS = 150
+SWITCH_STEPS = 120
 """The goal of a run is given within this many steps of another motion that starts at home."""
 AT_HOME = 0.15
 """Share of runs whose goal is given at home, at rest."""
@@ -102,7 +102,7 @@ def _flatten(paths: Tensor, speeds: Tensor, scene: TrapperScene) -> dict[str, Te
 
 
 def _arrivals(arguments: CollectArguments, scene: TrapperScene, index: int) -> dict[str, Tensor]:
-    """Runs of the static planner from home, most of them redirected on their way somewhere else or when they are there."""
+    """Runs of the static planner from home, most of them redirected on their way to another goal or at it."""
     task = ReachingTask(
         STATIC_PLANNERS[arguments.static](), arguments.num_envs, scene=scene, num_threads=arguments.threads
     )
