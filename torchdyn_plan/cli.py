@@ -13,7 +13,7 @@ from torchdyn_plan.cli_arguments import (
     SweepArguments,
     TrainArguments,
 )
-from torchdyn_plan.errors import TorchdynPlanError
+from torchdyn_plan.errors import OutputError, TorchdynPlanError
 
 
 def evaluate(arguments: EvaluateArguments) -> None:
@@ -65,6 +65,8 @@ def bench(arguments: BenchArguments) -> None:
 
     if arguments.out is not None:
         check_writable_folder(arguments.out.parent)
+        if arguments.out.is_dir():
+            raise OutputError(f"output file {str(arguments.out)!r} is a folder")
     rows = importlib.import_module(BENCHMARKS[arguments.name]).bench()
     for row in rows:
         print("  ".join(f"{name} {value}" for name, value in row.items()))

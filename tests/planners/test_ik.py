@@ -52,7 +52,7 @@ def test_actions_of_five_steps_are_one_path_whatever_the_arm_does_meanwhile():
 
 def test_a_changed_goal_flushes_the_path_in_its_row_alone():
     planner, td = IKPlanner(), observe(home(3), MIDDLE)
-    kept = planner(td)["plan", "path"].clone()
+    kept = planner.path(td["joint_pos"], planner(td)["goal"])
     td["step_count"], td["joint_pos"] = torch.ones(3, dtype=torch.int64), home(3, spread=0.05)
     td["goal"] = MIDDLE + torch.tensor([[0.0, 0.0, 0.0], [1e-3, 0.0, 0.0], [0.0, 0.0, 0.3]])
     planner(td)
@@ -64,7 +64,7 @@ def test_a_changed_goal_flushes_the_path_in_its_row_alone():
 
 def test_rows_at_step_zero_start_afresh():
     planner, td = IKPlanner(), observe(home(2), MIDDLE)
-    kept = planner(td)["plan", "path"].clone()
+    kept = planner.path(td["joint_pos"], planner(td)["goal"])
     td["step_count"], td["joint_pos"] = torch.tensor([0, 1]), home(2, spread=0.05)
     planner(td)
     torch.testing.assert_close(td["action"][0], planner.path(td["joint_pos"][:1], td["goal"][:1])[0, 0])
@@ -82,7 +82,7 @@ def test_memory_of_an_earlier_step_is_never_written_to():
     assert td["plan"] is plan
     for key in copy.keys():  # noqa: SIM118
         assert torch.equal(plan[key], copy[key]), key
-    assert sorted(plan.keys()) == ["path", "path_goal", "path_step", "window"]
+    assert sorted(plan.keys()) == ["path_goal", "path_pos", "path_step", "window"]
     assert later["plan", "path_step"].tolist() == [2, 2]
     assert torch.equal(later["plan", "window"], torch.arange(2))
 
@@ -94,7 +94,7 @@ def test_batch_dimensions_are_free_and_equal_a_loop(batch, dtype):
     joint_pos = home(*batch, dtype=dtype, spread=0.1)
     goal = goals(max(math.prod(batch), 1)).to(dtype)[: math.prod(batch)].reshape(*batch, 3)
     path, td = after(observe(joint_pos, goal), planner, 12)
-    assert td["plan", "path"].shape == (*batch, 5, 6)
+    assert td["plan", "path_pos"].shape == (*batch, 6)
     assert path.dtype == dtype
     rows = zip(joint_pos.reshape(-1, 6), goal.reshape(-1, 3), path.reshape(12, -1, 6).unbind(1), strict=True)
     for one_pos, one_goal, expected in rows:
@@ -159,5 +159,5 @@ def test_memory_survives_resets_at_different_moments():
             alone = TrapperEnv(1, num_threads=1, velocity=0.5)
             alone.start_from(episode)
             expected = alone.rollout(len(part), planner)[0]
-            for key in ("action", "goal", ("plan", "path"), ("plan", "path_step"), ("next", "joint_pos")):
+            for key in ("action", "goal", ("plan", "path_pos"), ("plan", "path_step"), ("next", "joint_pos")):
                 assert torch.equal(part[key], expected[key]), key

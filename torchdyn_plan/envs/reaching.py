@@ -12,6 +12,7 @@ from torchdyn_plan import keys
 from torchdyn_plan.envs.scene import TrapperScene
 from torchdyn_plan.envs.simulation import TrapperSimulation
 from torchdyn_plan.envs.trapping import is_reached
+from torchdyn_plan.errors import InputError
 from torchdyn_plan.kinematics.arm import Arm
 
 
@@ -39,13 +40,18 @@ class ReachingTask:
         self.reset()
 
     def reset(self, joint_pos: Tensor | None = None, joint_vel: Tensor | None = None) -> None:
-        """Put every arm home, at rest, or where it is told, (N, 6) [rad] and [rad/s]; all without a memory."""
+        """Put every arm home, or at ``joint_pos`` (N, 6) [rad]; all without a memory.
+
+        They are at rest, or move with ``joint_vel`` (N, 6) [rad/s], which needs ``joint_pos``: else an `InputError`.
+        """
+        if joint_vel is not None and joint_pos is None:
+            raise InputError("joint_vel needs joint_pos beside it, got None")
         count = self.simulation.num_envs
         far = torch.tensor([0.0, self.scene.half_side - 2 * self.scene.ball_radius], dtype=torch.float64)
         still = torch.zeros(count, 2, dtype=torch.float64)
         self.simulation.reset(torch.arange(count), far.expand(count, 2), still)
-        if joint_pos is not None and joint_vel is not None:
-            self.simulation.place_arms(joint_pos, joint_vel)
+        if joint_pos is not None:
+            self.simulation.place_arms(joint_pos, torch.zeros_like(joint_pos) if joint_vel is None else joint_vel)
         self._memory, self._steps = None, torch.zeros(count, dtype=torch.int64)
 
     @property

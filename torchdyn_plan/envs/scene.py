@@ -4,6 +4,7 @@
 import dataclasses
 import hashlib
 import json
+import math
 from dataclasses import dataclass
 
 import mujoco
@@ -12,6 +13,7 @@ import numpy as np
 from torchdyn_plan.checks import check_number
 from torchdyn_plan.envs.textures import felt, wood
 from torchdyn_plan.envs.ur5_bodies import add_ur5
+from torchdyn_plan.errors import InputError
 from torchdyn_plan.kinematics.ur5 import UR5_LINKS
 
 WORLD_BIT, BALL_BIT, ARM_BIT = 1, 2, 4
@@ -73,10 +75,16 @@ class TrapperScene:
     """[s]"""
 
     def __post_init__(self) -> None:
+        lowest = {"base_height": -math.inf, "home": -math.inf, "rolling_resistance": 0.0}
         for field in dataclasses.fields(self):
-            value = getattr(self, field.name)
-            if isinstance(value, float) and field.name not in ("rolling_resistance", "base_height"):
-                check_number(field.name, value, minimum=1e-9)
+            value, minimum = getattr(self, field.name), lowest.get(field.name, 1e-9)
+            if not isinstance(field.default, tuple):
+                check_number(field.name, value, minimum=minimum)
+                continue
+            if not isinstance(value, tuple) or len(value) != len(UR5_LINKS):
+                raise InputError(f"{field.name} must be a tuple of {len(UR5_LINKS)} numbers, got {value!r}")
+            for number in value:
+                check_number(field.name, number, minimum=minimum)
 
     @property
     def half_side(self) -> float:

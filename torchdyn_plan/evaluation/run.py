@@ -26,19 +26,27 @@ from torchdyn_plan.planners import DynamicPlanner, IKPlanner, OracleTrajectory, 
 
 Planner = Callable[[TensorDictBase], TensorDictBase]
 
-CHUNK = 64
-"""Rows that a network or the inverse kinematics sees at once, whatever the number of environments."""
+CHUNK = 16
+"""Rows that a network sees at once, whatever the number of environments: few, as few plan at the same step."""
+IK_CHUNK = 64
+"""Rows that the inverse kinematics sees at once, whatever the number of environments."""
 HORIZON = 300
 """Control steps that the recorded truth goes on after the end of an episode."""
 
-STATICS: dict[str, Callable[[], Planner]] = {"ik": lambda: IKPlanner(chunk=CHUNK)}
+STATICS: dict[str, Callable[[], Planner]] = {"ik": lambda: IKPlanner(chunk=IK_CHUNK)}
 """The static planners by name."""
 PLANNERS: dict[str, Callable[[str], Planner]] = {
     "pursuit": lambda static: TargetPursuit(STATICS[static]()),
-    "corner": lambda static: DynamicPlanner.from_pretrained(f"trapper-{static}", chunk=CHUNK),
-    "oracle": lambda static: OracleTrajectory.from_pretrained(f"trapper-{static}", chunk=CHUNK),
+    "corner": lambda static: _pretrained(DynamicPlanner, static),
+    "oracle": lambda static: _pretrained(OracleTrajectory, static),
 }
 """The planners for a moving target by name, on the static planner of a given name."""
+
+
+def _pretrained(kind: type[DynamicPlanner], static: str) -> DynamicPlanner:
+    planner = kind.from_pretrained(f"trapper-{static}", chunk=CHUNK)
+    planner.static = STATICS[static]()
+    return planner
 
 
 def evaluate(arguments: EvaluateArguments) -> None:
@@ -56,7 +64,7 @@ def evaluate(arguments: EvaluateArguments) -> None:
 
 def run_points(arguments: EvaluateArguments) -> dict[str, EpisodeOutcomes]:
     """Outcomes of the same episodes for each planner that ``arguments`` name."""
-    with _one_thread():
+    with one_thread():
         planners = {name: PLANNERS[name](arguments.static) for name in arguments.planners}
         future, solvable = record_truth(arguments)
         return {name: run_episodes(planner, arguments, future, solvable, name) for name, planner in planners.items()}
@@ -94,24 +102,35 @@ def run_episodes(
         min(arguments.num_envs, count), velocity=arguments.velocity, friction=arguments.friction, seed=arguments.seed,
         split=arguments.split, num_threads=arguments.threads,
     )  # fmt: skip
-    shows_future = keys.TARGET_FUTURE in getattr(planner, "in_keys", ())
-    log = _Log.empty(count)
+    log = EpisodeLog.empty(count)
     started = time.perf_counter()
     with torch.no_grad(), tqdm(total=count, desc=name, unit="episode", leave=False) as bar:
-        tensordict = env.reset()
-        while not log.done.all():
-            if shows_future:
-                tensordict[keys.TARGET_FUTURE] = future[tensordict[keys.EPISODE].clamp(max=count - 1)]
-            stepped, tensordict = env.step_and_maybe_reset(planner(tensordict))
-            bar.update(log.add(env.scene, stepped))
+        for ended in play(planner, env, log, future):
+            bar.update(ended)
+            if bar.n >= count:
+                break
     return EpisodeOutcomes(
         trapped=log.trapped, steps=log.steps, replans=log.replans, touched=log.touched, pocketed=log.pocketed,
         solvable=solvable, seconds=time.perf_counter() - started,
     )  # fmt: skip
 
 
+def play(planner: Planner, env: TrapperEnv, log: EpisodeLog, future: Tensor | None = None) -> Iterator[int]:
+    """Step all environments once for each value taken, which is the number of ``log``'s episodes that the step ended.
+
+    ``future`` (E, T, 3) is the recorded truth for planners that read ``target_future``.
+    """
+    shows_future = future is not None and keys.TARGET_FUTURE in getattr(planner, "in_keys", ())
+    tensordict = env.reset()
+    while True:
+        if shows_future:
+            tensordict[keys.TARGET_FUTURE] = future[tensordict[keys.EPISODE].clamp(max=len(future) - 1)]
+        stepped, tensordict = env.step_and_maybe_reset(planner(tensordict))
+        yield log.add(env.scene, stepped)
+
+
 @dataclasses.dataclass
-class _Log:
+class EpisodeLog:
     """What has happened in each episode so far; every tensor is ``(E,)``."""
 
     done: Tensor
@@ -122,7 +141,7 @@ class _Log:
     replans: Tensor
 
     @classmethod
-    def empty(cls, count: int) -> _Log:
+    def empty(cls, count: int) -> EpisodeLog:
         flags = [torch.zeros(count, dtype=torch.bool) for _ in range(4)]
         return cls(*flags, steps=torch.full((count,), -1), replans=torch.zeros(count, dtype=torch.int64))
 
@@ -149,8 +168,8 @@ class _Log:
 
 
 @contextmanager
-def _one_thread() -> Iterator[None]:
-    """Networks this small are fastest on one thread, which leaves the cores to the simulation."""
+def one_thread() -> Iterator[None]:
+    """Torch on one thread: networks this small are fastest on one thread, which leaves the cores to the simulation."""
     threads = torch.get_num_threads()
     torch.set_num_threads(1)
     try:

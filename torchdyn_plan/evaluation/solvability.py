@@ -116,9 +116,11 @@ def _load(path: Path) -> Tensor | None:
     """Steps in the file; None if there is none, or a damaged one, which is measured again."""
     try:
         content: dict[str, Any] = load_file(path)
-        return content["steps"]
+        steps: Tensor = content["steps"]
     except (OSError, SafetensorError, KeyError):
         return None
+    whole = steps.ndim == 2 and steps.shape[0] == steps.shape[1] and not steps.is_floating_point()
+    return steps if whole else None
 
 
 def _cache() -> Path:

@@ -21,8 +21,7 @@ def dls_step(jacobian: Tensor, error: Tensor, damping: float) -> Tensor:
     """
     # Dividing rows and columns by λ keeps float32 well-conditioned: (JJᵀ/λ² + I).
     scaled = jacobian / damping
-    gram = scaled @ scaled.mT
-    gram.diagonal(dim1=-2, dim2=-1).add_(1.0)
+    gram = scaled @ scaled.mT + torch.eye(6, dtype=scaled.dtype, device=scaled.device)
     factor, _ = torch.linalg.cholesky_ex(gram)
     weights = torch.cholesky_solve(error.unsqueeze(-1) / damping, factor)
     return (scaled.mT @ weights).squeeze(-1)

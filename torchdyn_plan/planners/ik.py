@@ -9,16 +9,15 @@ from typing import Any
 import torch
 from tensordict import TensorDict, TensorDictBase
 from tensordict.nn import TensorDictModuleBase
-from torch import Tensor
+from torch import Tensor, nn
 
 from torchdyn_plan import keys
 from torchdyn_plan.checks import check_finite, check_number, check_trailing_shape
 from torchdyn_plan.kinematics.arm import Arm
 from torchdyn_plan.kinematics.dls import dls_step, limited_step, upright_error
 from torchdyn_plan.planners.protocol import read
-from torchdyn_plan.planners.rows import apply_to_rows
 
-PATH_NAMES = ("path", "path_step", "path_goal")
+PATH_NAMES = ("path_pos", "path_step", "path_goal")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -55,9 +54,10 @@ class IKPlanner(TensorDictModuleBase):
     """Drives the arm to ``goal`` with its box upright and square; a goal on the table is approached from above.
 
     Reads ``joint_pos`` (*B, 6) [rad], ``goal`` (*B, 3) [m, world] and ``step_count`` (*B,); writes ``action`` (*B, 6)
-    and its path under ``plan``. A path of `PATH_LENGTH` steps is solved at a time and flushed when the goal changes
-    (paper, Section III-B.1); rows with ``step_count`` 0 start afresh. Goals outside the table or the arm's reach are
-    clamped to a near place inside.
+    and its memory under ``plan``. The arm follows a path of `PATH_LENGTH` steps from where it was when the path began,
+    whatever it does meanwhile; the path is flushed when the goal changes (paper, Section III-B.1), and rows with
+    ``step_count`` 0 start afresh. A control step solves that step of the path alone: a flushed path costs nothing.
+    Goals outside the table or the arm's reach are clamped to a near place inside.
     """
 
     PATH_LENGTH = 5
@@ -97,7 +97,7 @@ class IKPlanner(TensorDictModuleBase):
         self.register_buffer("_limit", self.arm.speed_limit * control_step, False)
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
-        """Write ``action`` for the ``goal`` in ``tensordict``, planning anew where the path is used up or stale.
+        """Write ``action`` for the ``goal`` in ``tensordict``, on a new path where the old one is used up or stale.
 
         Raises:
             InputError: a key is missing, a shape is wrong, or the goal holds a NaN or an infinity.
@@ -107,26 +107,35 @@ class IKPlanner(TensorDictModuleBase):
         if not torch.compiler.is_compiling():
             self._check(joint_pos, goal)
         plan = tensordict.get(keys.PLAN, None)
-        path, path_step, path_goal = self._recall(plan, joint_pos, goal)
-        stale = (path_step >= self.PATH_LENGTH) | (path_goal != goal).any(-1)
-        stale |= step_count.reshape(stale.shape) == 0
-        (path,) = apply_to_rows(lambda q, g: (self.path(q, g),), stale, (joint_pos, goal), (path,), chunk=self.chunk)
-        path_step = torch.where(stale, 0, path_step)
-        index = path_step[..., None, None].expand(*path_step.shape, 1, path.shape[-1])
-        tensordict.set(keys.ACTION, path.gather(-2, index).squeeze(-2))
+        path_pos, path_step = self._recall(plan, joint_pos, goal, step_count)
+        action, path_pos = self._step_rows(path_pos, goal)
+        tensordict.set(keys.ACTION, action.to(joint_pos.dtype))
         entries = {} if plan is None else dict(plan.items())
-        entries.update(zip(PATH_NAMES, (path, path_step + 1, goal), strict=True))
+        entries.update(zip(PATH_NAMES, (path_pos.to(joint_pos.dtype), path_step + 1, goal), strict=True))
         # A new one each step: tensordicts of earlier steps may share the old one.
         tensordict.set(keys.PLAN, TensorDict(entries, tensordict.batch_size, device=tensordict.device))
         return tensordict
 
-    def _recall(self, plan: TensorDictBase | None, joint_pos: Tensor, goal: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-        """What was written into ``plan`` in the step before; a path that is used up if nothing was."""
-        if plan is not None and PATH_NAMES[0] in plan.keys():  # noqa: SIM118
-            path, path_step, path_goal = map(plan.get, PATH_NAMES)
-            return path, path_step, path_goal
-        path = joint_pos.new_zeros(*joint_pos.shape[:-1], self.PATH_LENGTH, joint_pos.shape[-1])
-        return path, torch.full(joint_pos.shape[:-1], self.PATH_LENGTH, device=joint_pos.device), goal
+    def _recall(
+        self, plan: TensorDictBase | None, joint_pos: Tensor, goal: Tensor, step_count: Tensor
+    ) -> tuple[Tensor, Tensor]:
+        """Where the path stands, (*B, N) and its step (*B,); where ``plan`` holds none to follow, a new path begins."""
+        if plan is None or PATH_NAMES[0] not in plan.keys():  # noqa: SIM118
+            return joint_pos, torch.zeros(joint_pos.shape[:-1], dtype=torch.int64, device=joint_pos.device)
+        path_pos, path_step, path_goal = map(plan.get, PATH_NAMES)
+        ends = (path_step >= self.PATH_LENGTH) | (path_goal != goal).any(-1)
+        ends |= step_count.reshape(ends.shape) == 0
+        return torch.where(ends.unsqueeze(-1), joint_pos, path_pos), path_step.masked_fill(ends, 0)
+
+    def _step_rows(self, joint_pos: Tensor, goal: Tensor) -> tuple[Tensor, Tensor]:
+        """`step`, in blocks of ``chunk`` rows if there is one."""
+        if self.chunk is None:
+            return self.step(joint_pos, goal)
+        batch, padding = joint_pos.shape, (0, 0, 0, -joint_pos.shape[:-1].numel() % self.chunk)
+        rows = [nn.functional.pad(value.reshape(-1, value.shape[-1]), padding) for value in (joint_pos, goal)]
+        action, reached = self.step(*rows)
+        count = batch[:-1].numel()
+        return action[:count].reshape(batch), reached[:count].reshape(batch)
 
     def _check(self, joint_pos: Tensor, goal: Tensor) -> None:
         check_trailing_shape(keys.JOINT_POS, joint_pos, self.arm.num_joints)
@@ -137,18 +146,33 @@ class IKPlanner(TensorDictModuleBase):
 
     def path(self, joint_pos: Tensor, goal: Tensor) -> Tensor:
         """Next `PATH_LENGTH` actions from ``joint_pos`` (*B, N) towards ``goal`` (*B, 3) [m, world]: (*B, 5, N)."""
-        joint_pos, goal = joint_pos.to(self._base.dtype), goal.to(self._base.dtype)
-        target, on_table = self.tool_target(goal)
         actions = []
         for _ in range(self.PATH_LENGTH):
-            pose, jacobian = self.arm.pose_and_jacobian(joint_pos)
-            way = way_to(pose[..., :3, 3], target - self._base, on_table, self.approach, self._base[2])
-            error = torch.cat([way, upright_error(pose[..., :3, :3])], dim=-1)
-            step = limited_step(dls_step(jacobian, error, self.damping), self._limit, self.gain)
-            step = torch.clamp(step, self.arm.lower - joint_pos, self.arm.upper - joint_pos)
-            actions.append((step / self._limit).clamp(-1.0, 1.0))
-            joint_pos = joint_pos + step
+            action, joint_pos = self.step(joint_pos, goal)
+            actions.append(action)
         return torch.stack(actions, dim=-2)
+
+    def step(self, joint_pos: Tensor, goal: Tensor) -> tuple[Tensor, Tensor]:
+        """One step of the path from ``joint_pos`` (*B, N) [rad] towards ``goal`` (*B, 3) [m, world].
+
+        Returns:
+            The action ``(*B, N)`` and the joint angles to which the path has come ``(*B, N)`` [rad].
+        """
+        joint_pos, goal = joint_pos.to(self._base.dtype), goal.to(self._base.dtype)
+        target, on_table = self.tool_target(goal)
+        pose, jacobian = self._pose_and_jacobian(joint_pos)
+        way = way_to(pose[..., :3, 3], target - self._base, on_table, self.approach, self._base[2])
+        error = torch.cat([way, upright_error(pose[..., :3, :3])], dim=-1)
+        step = limited_step(dls_step(jacobian, error, self.damping), self._limit, self.gain)
+        step = torch.clamp(step, self.arm.lower - joint_pos, self.arm.upper - joint_pos)
+        return (step / self._limit).clamp(-1.0, 1.0), joint_pos + step
+
+    def _pose_and_jacobian(self, joint_pos: Tensor) -> tuple[Tensor, Tensor]:
+        """The arm's, from products of always ``chunk`` rows where ``joint_pos`` is a multiple of them."""
+        if self.chunk is None or joint_pos.ndim != 2 or len(joint_pos) <= self.chunk:
+            return self.arm.pose_and_jacobian(joint_pos)
+        pose, jacobian = zip(*map(self.arm.pose_and_jacobian, joint_pos.split(self.chunk)), strict=True)
+        return torch.cat(pose), torch.cat(jacobian)
 
     def tool_target(self, goal: Tensor) -> tuple[Tensor, Tensor]:
         """Place of the box mouth for ``goal`` (*B, 3), both [m, world], and whether the goal is on the table (*B,)."""
@@ -176,17 +200,16 @@ def way_to(tool: Tensor, target: Tensor, on_table: Tensor, approach: Approach, b
         approach: heights and distances.
         base_height: height of the base above the table [m].
     """
-    x, y, height = tool[..., 0], tool[..., 1], tool[..., 2] + base_height
+    x, y, z = tool.unbind(-1)
+    goal_x, goal_y, goal_z = target.unbind(-1)
     radius = torch.hypot(x, y).clamp_min(1e-6)
-    away = torch.hypot(target[..., 0] - x, target[..., 1] - y)
-    reach = torch.hypot(target[..., 0], target[..., 1]) - radius
-    cross, dot = x * target[..., 1] - y * target[..., 0], x * target[..., 0] + y * target[..., 1]
-    turn = torch.atan2(cross, dot)
-    forward = reach / radius
+    away = torch.hypot(goal_x - x, goal_y - y)
+    forward = (torch.hypot(goal_x, goal_y) - radius) / radius
+    turn = torch.atan2(x * goal_y - y * goal_x, x * goal_x + y * goal_y)
     side = torch.stack([x * forward - y * turn, y * forward + x * turn], dim=-1)
     far = ((away - approach.drop_distance) / 0.015).clamp(0.0, 1.0)
-    lift = approach.travel_height - approach.down_height
-    wanted = target[..., 2] + base_height + torch.where(on_table, lift * far, 0.0)
+    height, lift = z + base_height, approach.travel_height - approach.down_height
+    wanted = goal_z + base_height + torch.where(on_table, lift * far, 0.0)
     low = torch.maximum(far, (~on_table).to(far.dtype)) * (approach.clear_height - height) / 0.02
     side = side * (1.0 - low.clamp(0.0, 1.0)).unsqueeze(-1)
     return torch.cat([side, (wanted - height).unsqueeze(-1)], dim=-1)

@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import Any
 
 import torch
+from safetensors import SafetensorError, safe_open
 from safetensors.torch import save_file
 from tensordict import TensorDictBase
 from torch import Tensor
@@ -18,6 +19,7 @@ from torchdyn_plan.envs.reaching import ReachingTask
 from torchdyn_plan.envs.scene import TrapperScene
 from torchdyn_plan.envs.simulation import TrapperSimulation
 from torchdyn_plan.envs.trapping import is_pocketed
+from torchdyn_plan.errors import InputError
 from torchdyn_plan.files import write_json, write_whole
 from torchdyn_plan.planners.ik import IKPlanner
 from torchdyn_plan.versions import library_versions
@@ -38,7 +40,12 @@ STATIC_PLANNERS: dict[str, Callable[[], Callable[[TensorDictBase], TensorDictBas
 
 
 def collect(arguments: CollectArguments) -> None:
-    """Write the shards that ``arguments`` ask for, each with a description beside it; shards there are are kept."""
+    """Write the shards that ``arguments`` ask for, and a description of them; whole shards that there are are kept.
+
+    Raises:
+        InputError: a shard that is there was made in another scene or otherwise than ``arguments`` say, or is damaged.
+        OutputError: the folder cannot be written to.
+    """
     from tqdm import tqdm
 
     scene = TrapperScene()
@@ -47,10 +54,11 @@ def collect(arguments: CollectArguments) -> None:
     shards = -(-arguments.episodes // SHARD[arguments.what])
     for index in tqdm(range(shards), desc=f"collect {arguments.what}", unit="shard"):
         path = arguments.out / f"{arguments.what}-{arguments.seed}-{index:03d}.safetensors"
-        if path.exists():
+        made = _made(arguments, scene, index)
+        if path.exists() and _is_kept(path, made):
             continue
         tensors = record(arguments, scene, index)
-        write_whole(path, lambda temporary, tensors=tensors: save_file(tensors, temporary))
+        write_whole(path, lambda temporary, tensors=tensors, made=made: save_file(tensors, temporary, made))
     fields = {name: str(value) if isinstance(value, Path) else value for name, value in _fields(arguments).items()}
     about = {"arguments": fields, "scene": scene.digest(), "versions": library_versions()}
     write_json(arguments.out / f"{arguments.what}-{arguments.seed}.json", about)
@@ -62,6 +70,29 @@ SHARD = {"paths": 1024, "arrivals": 4096}
 
 def _fields(arguments: CollectArguments) -> dict[str, Any]:
     return dataclasses.asdict(arguments)
+
+
+def _made(arguments: CollectArguments, scene: TrapperScene, index: int) -> dict[str, str]:
+    """What decides a shard's numbers: its metadata."""
+    episodes = sum(map(len, _shard_rows(arguments, index)))
+    shared = {"scene": scene.digest(), "num_envs": str(arguments.num_envs), "episodes": str(episodes)}
+    return shared | ({"static": arguments.static} if arguments.what == "arrivals" else {})
+
+
+def _is_kept(path: Path, made: dict[str, str]) -> bool:
+    """Whether the shard at ``path`` is as it would be ``made``; not one that another number of episodes cut short."""
+    try:
+        with safe_open(path, framework="pt") as content:
+            there = content.metadata() or {}
+    except (SafetensorError, OSError) as error:
+        raise InputError(f"{str(path)!r} is not a whole safetensors file: {error}") from error
+    differing = [name for name in made if there.get(name, made[name]) != made[name]]
+    for name in differing:
+        if name != "episodes":
+            raise InputError(
+                f"{str(path)!r} is of another collection: {name} is {there[name]} there, {made[name]} here"
+            )
+    return not differing
 
 
 def _shard_rows(arguments: CollectArguments, index: int) -> Iterator[Tensor]:
