@@ -160,7 +160,7 @@ class CollectArguments:
     static: str = "ik"
     """Static planner whose arrivals are measured: ik."""
     episodes: int = 20000
-    """Number of balls rolled, or of runs of the static planner."""
+    """Number of balls rolled, or of sequences of runs of the static planner."""
     seed: int = 0
     """Which series of episodes."""
     num_envs: int = 256

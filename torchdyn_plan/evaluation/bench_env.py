@@ -92,7 +92,7 @@ def bench(
 ) -> list[dict[str, Any]]:
     """A row for MuJoCo alone and one for the loop around it, for each size and each way of driving the arms.
 
-    ``share_of_raw`` is MuJoCo's time over the loop's, for the same commands; ``max_error`` compares all their positions.
+    ``share_of_raw`` is MuJoCo's time over the loop's for the same commands; ``max_error`` compares their positions.
 
     Args:
         planners: makers of planners by name; those of the command line that ship by default.

@@ -142,6 +142,7 @@ class EpisodeLog:
 
     @classmethod
     def empty(cls, count: int) -> EpisodeLog:
+        """The log of ``count`` episodes to come."""
         flags = [torch.zeros(count, dtype=torch.bool) for _ in range(4)]
         return cls(*flags, steps=torch.full((count,), -1), replans=torch.zeros(count, dtype=torch.int64))
 

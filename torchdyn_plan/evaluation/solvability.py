@@ -97,7 +97,7 @@ def arrival_map(
     static: str, planner: Callable[[TensorDictBase], TensorDictBase], scene: TrapperScene, *, num_threads: int = 0
 ) -> ArrivalMap:
     """The map of the static planner called ``static`` in ``scene``: shipped, cached, or measured now and cached."""
-    name = f"arrivals-{static}-{scene.digest()}.safetensors"
+    name = arrivals_name(static, scene)
     for folder in (SHIPPED, _cache()):
         steps = _load(folder / name)
         if steps is not None:
@@ -105,6 +105,11 @@ def arrival_map(
     arrivals = measure_arrivals(planner, scene, num_threads=num_threads)
     save_arrivals(arrivals, _cache() / name)
     return arrivals
+
+
+def arrivals_name(static: str, scene: TrapperScene) -> str:
+    """Name of the file that holds the map of a static planner in a scene."""
+    return f"arrivals-{static}-{scene.digest()}.safetensors"
 
 
 def save_arrivals(arrivals: ArrivalMap, path: Path) -> None:

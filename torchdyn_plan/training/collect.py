@@ -22,20 +22,13 @@ from torchdyn_plan.envs.trapping import is_pocketed
 from torchdyn_plan.errors import InputError
 from torchdyn_plan.files import write_json, write_whole
 from torchdyn_plan.planners.ik import IKPlanner
+from torchdyn_plan.training.runs import record_runs
 from torchdyn_plan.versions import library_versions
 
 PATH_STEPS = 2000
 """Control steps of a recorded path: four times an episode (paper, Section IV)."""
 FASTEST = 5.0
 """Balls start with velocities up to this [m/s]."""
-STATES_PER_RUN = 5
-"""Intermediate states taken from each run of the static planner (paper, Section III-B.3)."""
-RUN_STEPS = 220
-"""Control steps that a run may take after its goal was given."""
-SWITCH_STEPS = 120
-"""The goal of a run is given within this many steps of another motion that starts at home."""
-AT_HOME = 0.15
-"""Share of runs whose goal is given at home, at rest."""
 STATIC_PLANNERS: dict[str, Callable[[], Callable[[TensorDictBase], TensorDictBase]]] = {"ik": IKPlanner}
 
 
@@ -64,7 +57,7 @@ def collect(arguments: CollectArguments) -> None:
     write_json(arguments.out / f"{arguments.what}-{arguments.seed}.json", about)
 
 
-SHARD = {"paths": 1024, "arrivals": 4096}
+SHARD = {"paths": 1024, "arrivals": 2048}
 """Episodes in a shard."""
 
 
@@ -133,62 +126,10 @@ def _flatten(paths: Tensor, speeds: Tensor, scene: TrapperScene) -> dict[str, Te
 
 
 def _arrivals(arguments: CollectArguments, scene: TrapperScene, index: int) -> dict[str, Tensor]:
-    """Runs of the static planner from home, most of them redirected on their way to another goal or at it."""
+    """Runs of the static planner, whole sequences of every arm."""
     task = ReachingTask(
         STATIC_PLANNERS[arguments.static](), arguments.num_envs, scene=scene, num_threads=arguments.threads
     )
     draw = torch.Generator().manual_seed(arguments.seed * 1_000_003 + index)
-    parts = []
-    for episodes in _shard_rows(arguments, index):
-        runs = _run(task, draw)
-        parts.append({name: value[: len(episodes)].flatten(0, 1) for name, value in runs.items()})
-    shard = {name: torch.cat([part[name] for part in parts]) for name in parts[0]}
-    settled = shard.pop("settled")
-    return {name: value[settled].contiguous() for name, value in shard.items()}
-
-
-def _run(task: ReachingTask, draw: torch.Generator) -> dict[str, Tensor]:
-    """One run of every arm: `STATES_PER_RUN` states each, with their goals and the steps that were left to arrival."""
-    task.reset()
-    count = task.simulation.num_envs
-    before, goal = draw_goals(task.scene, count, draw), draw_goals(task.scene, count, draw)
-    given = torch.randint(SWITCH_STEPS, (count,), generator=draw)
-    given[torch.rand(count, generator=draw) < AT_HOME] = 0
-    states = torch.empty(SWITCH_STEPS + RUN_STEPS + 1, count, task.robot_state.shape[-1])
-    arrived = torch.full((count,), -1)
-    for step in range(SWITCH_STEPS + RUN_STEPS + 1):
-        states[step] = task.robot_state
-        now = (step >= given) & (arrived < 0) & task.is_reached(goal)
-        arrived = torch.where(now, step, arrived)
-        task.step(torch.where((step >= given).unsqueeze(-1), goal, before))
-    never = arrived < 0
-    moving = states[-1, :, 6:12].abs().amax(-1) > 0.05
-    last = torch.where(never, given + RUN_STEPS // 2, arrived)
-    share = torch.rand(count, STATES_PER_RUN, generator=draw)
-    share[:, 0] = 0.0
-    taken = (given.unsqueeze(-1) + share * (last - given + 1).unsqueeze(-1)).long().clamp(max=len(states) - 1)
-    rows = torch.arange(count).unsqueeze(-1)
-    steps = torch.where(never.unsqueeze(-1), -1, arrived.unsqueeze(-1) - taken)
-    return {
-        "robot_state": states[taken, rows],
-        "goal": goal.unsqueeze(1).expand(-1, STATES_PER_RUN, -1),
-        "arrival": steps,
-        "run": rows.expand(-1, STATES_PER_RUN) + torch.randint(2**40, (1,), generator=draw),
-        "settled": ~(never & moving).unsqueeze(-1).expand(-1, STATES_PER_RUN),
-    }
-
-
-def draw_goals(scene: TrapperScene, count: int, draw: torch.Generator) -> Tensor:
-    """Goals ``(count, 3)`` [m, world]: on the table and above it, near the arm, all over, and beyond the rails."""
-    kind, height = torch.rand(2, count, generator=draw)
-    flat = 2.0 * torch.rand(count, 2, generator=draw) - 1.0
-    angle, radius = torch.rand(2, count, generator=draw)
-    turn, reach = torch.pi * angle, 0.15 + 0.9 * radius.sqrt()
-    near = torch.stack([reach * turn.cos(), reach * turn.sin()], -1) + torch.tensor(scene.base_pos[:2])
-    place = torch.where((kind < 0.5).unsqueeze(-1), near, flat * scene.half_side)
-    place = torch.where((kind > 0.9).unsqueeze(-1), flat * 3.0, place)
-    low = scene.ball_radius + 0.005 * (2.0 * torch.rand(count, generator=draw) - 1.0)
-    high = scene.ball_radius + 0.015 + 0.25 * torch.rand(count, generator=draw)
-    sunk = -0.1 * torch.rand(count, generator=draw)
-    z = torch.where(height < 0.6, low, torch.where(height < 0.97, high, sunk))
-    return torch.cat([place, z.unsqueeze(-1)], dim=-1)
+    parts = [record_runs(task, draw) for _ in _shard_rows(arguments, index)]
+    return {name: torch.cat([part[name] for part in parts]) for name in parts[0]}
