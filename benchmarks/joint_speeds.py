@@ -16,7 +16,7 @@ from torchdyn_plan.files import write_json
 from torchdyn_plan.kinematics import UR5_LINKS, UR5_SPEED_LIMIT
 from torchdyn_plan.versions import library_versions, machine
 
-AFTERMATH = 25
+AFTERMATH = 50
 """Control steps after a contact that still count as contact: the arm swings out."""
 
 

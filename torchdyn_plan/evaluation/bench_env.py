@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from typing import Any, NamedTuple
 
 import torch
@@ -43,24 +43,24 @@ class Entry(NamedTuple):
 
 
 class TapedSimulation(TrapperSimulation):
-    """A simulation that writes down what MuJoCo is given; who reads the ``tape`` empties it."""
+    """A simulation that writes down what MuJoCo is given; who reads ``tape`` and ``pending`` empties them."""
 
     def __init__(self, *arguments: Any, **settings: Any) -> None:
         """Build the simulation as `TrapperSimulation` does, with an empty tape."""
         super().__init__(*arguments, **settings)
         self.tape: list[Entry] = []
-        self._resets: list[Reset] = []
+        self.pending: list[Reset] = []
 
     def reset(self, rows: Tensor, ball_pos: Tensor, ball_vel: Tensor) -> None:
         """Put ``rows`` back and write down their state."""
         super().reset(rows, ball_pos, ball_vel)
-        self._resets.append(Reset(rows, self.qpos[rows], self._qvel[rows]))
+        self.pending.append(Reset(rows, self.qpos[rows], self._qvel[rows]))
 
     def step(self, action: Tensor | None = None, rows: Tensor | None = None) -> None:
         """Step, and write down the servos' commands."""
         super().step(action, rows)
-        self.tape.append(Entry(tuple(self._resets), self._ctrl.clone()))
-        self._resets.clear()
+        self.tape.append(Entry(tuple(self.pending), self._ctrl.clone()))
+        self.pending.clear()
 
 
 class RawSimulation:
@@ -74,11 +74,15 @@ class RawSimulation:
             torch.from_numpy(self.batch.bind(name)) for name in ("qpos", "qvel", "ctrl")
         )
 
-    def step(self, entry: Entry) -> None:
-        """One control step."""
-        for rows, qpos, qvel in entry.resets:
+    def put_back(self, resets: Iterable[Reset]) -> None:
+        """Reset environments to the states written down."""
+        for rows, qpos, qvel in resets:
             self.batch.reset(rows.numpy())
             self.qpos[rows], self._qvel[rows] = qpos, qvel
+
+    def step(self, entry: Entry) -> None:
+        """One control step."""
+        self.put_back(entry.resets)
         self._ctrl.copy_(entry.ctrl)
         self.batch.step(nstep=self.substeps)
 
@@ -142,7 +146,9 @@ def _take_turns(
         count = min(BLOCK, steps - len(taken))
         taken += [_duration(next, loop) for _ in range(count)]
         raw += [_duration(alone.step, entry) for entry in taped.tape]
+        alone.put_back(taped.pending)
         taped.tape.clear()
+        taped.pending.clear()
         error = max(error, float((alone.qpos - taped.qpos).abs().max()))
         progress(count)
     return raw, taken, error

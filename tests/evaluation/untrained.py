@@ -1,0 +1,12 @@
+"""A dynamic planner of untrained networks: it plans nonsense, at the right steps."""
+
+import torch
+
+from torchdyn_plan.nets import ETANetwork, Forecaster
+from torchdyn_plan.planners import DynamicPlanner, IKPlanner
+
+
+def untrained(**settings):
+    torch.manual_seed(0)
+    nets = Forecaster(hidden=8, channels=4).eval(), ETANetwork(hidden=8).eval()
+    return DynamicPlanner(IKPlanner(chunk=8), *nets, chunk=8, **settings).requires_grad_(False)
