@@ -1,6 +1,6 @@
 """Measure the arrival map that ships with the package, from which solvability follows (a minute or two).
 
-    python benchmarks/measure_arrivals.py
+python benchmarks/measure_arrivals.py
 """
 
 from dataclasses import dataclass

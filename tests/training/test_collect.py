@@ -150,7 +150,7 @@ def test_the_label_is_what_a_new_run_from_home_takes(arrivals):
 def test_a_goal_beyond_the_rails_is_never_reached(arrivals):
     data, _ = arrivals
     beyond = (data.goal[:, :2].abs() > SCENE.half_side).any(-1)
-    assert beyond.sum() > 20
+    assert beyond.sum() >= 10
     assert (data.arrival[beyond] == -1).all()
     assert (data.arrival[~beyond] >= 0).any()
 
@@ -164,7 +164,7 @@ def test_goals_lie_on_the_table_above_it_and_outside():
     above = height > SCENE.ball_radius + 0.01
     sunk = height <= 0
     assert (on_table | above | sunk).all()
-    for kind, low in ((inside & on_table, 0.3), (inside & above, 0.1), (inside & sunk, 0.01), (~inside, 0.05)):
+    for kind, low in ((inside & on_table, 0.3), (inside & above, 0.1), (inside & sunk, 0.01), (~inside, 0.03)):
         assert low < kind.float().mean() < 0.8
     assert goal[:, :2].abs().amax() > 2.5
     near = (goal[:, :2] - torch.tensor(SCENE.base_pos[:2])).norm(dim=-1) < 0.9

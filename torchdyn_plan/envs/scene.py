@@ -1,4 +1,5 @@
-# pyright: reportAttributeAccessIssue=false -- mujoco hides its names from type checkers
+# mujoco hides its names from type checkers.
+# pyright: reportAttributeAccessIssue=false
 """The Trapper scene: a UR5 with a box, a billiard table with eight pockets, and a ball, from one frozen dataclass."""
 
 import dataclasses

@@ -1,4 +1,5 @@
-# pyright: reportAttributeAccessIssue=false -- mujoco hides its names from type checkers
+# mujoco hides its names from type checkers.
+# pyright: reportAttributeAccessIssue=false
 """The UR5 as MuJoCo bodies, made from the same table as its kinematic chain."""
 
 import math

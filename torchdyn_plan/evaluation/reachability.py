@@ -1,3 +1,5 @@
+# mujoco hides its names from type checkers.
+# pyright: reportAttributeAccessIssue=false
 """Which places of the table the arm can cover at all: a question to the scene, whatever a planner can do."""
 
 from __future__ import annotations

@@ -120,10 +120,11 @@ def play(planner: Planner, env: TrapperEnv, log: EpisodeLog, future: Tensor | No
 
     ``future`` (E, T, 3) is the recorded truth for planners that read ``target_future``.
     """
-    shows_future = future is not None and keys.TARGET_FUTURE in getattr(planner, "in_keys", ())
+    if keys.TARGET_FUTURE not in getattr(planner, "in_keys", ()):
+        future = None
     tensordict = env.reset()
     while True:
-        if shows_future:
+        if future is not None:
             tensordict[keys.TARGET_FUTURE] = future[tensordict[keys.EPISODE].clamp(max=len(future) - 1)]
         stepped, tensordict = env.step_and_maybe_reset(planner(tensordict))
         yield log.add(env.scene, stepped)
@@ -148,7 +149,7 @@ class EpisodeLog:
 
     def add(self, scene: TrapperScene, stepped: TensorDict | TensorDictBase) -> int:
         """Take in one step of all environments; returns how many episodes it ended."""
-        after = stepped["next"]
+        after: TensorDictBase = stepped.get("next")
         episode = after[keys.EPISODE]
         touched = is_touched(scene, after[keys.TOOL_POS], after[keys.TARGET_POS])
         done = after["done"].squeeze(-1)
