@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import Any
 
 import tyro
+from torch import Tensor
 
 from torchdyn_plan.cli_arguments import EvaluateArguments
 from torchdyn_plan.envs.scene import TrapperScene
@@ -30,8 +31,10 @@ FRICTION = {0.0: 0.78, 2.5: 0.78, 5.0: 0.76, 7.5: 0.68, 9.5: 0.64}
 class Arguments:
     """Measure the calibration figures of the scene."""
 
-    episodes: int = 1000
-    """Episodes a point."""
+    episodes: int = 4000
+    """Episodes a point for solvable shares."""
+    pursuit_episodes: int = 1000
+    """Episodes a point for target pursuit."""
     split: str = "test"
     """Series of episodes: test, or dev while tuning."""
     seed: int = 0
@@ -46,37 +49,34 @@ def measure(arguments: Arguments) -> list[dict[str, Any]]:
     """A row for each figure of the paper, ours beside it."""
     rows = []
     for velocity, paper in SOLVABLE.items():
-        rows.append(_row("solvable", _solvable(arguments, velocity), arguments, paper, velocity=velocity))
+        rows.append(_row("solvable", _solvable(arguments, velocity), paper, velocity=velocity))
     for friction, paper in FRICTION.items():
-        count = _solvable(arguments, FRICTION_VELOCITY, friction)
-        rows.append(_row("solvable", count, arguments, paper, velocity=FRICTION_VELOCITY, friction=friction))
+        solvable = _solvable(arguments, FRICTION_VELOCITY, friction)
+        rows.append(_row("solvable", solvable, paper, velocity=FRICTION_VELOCITY, friction=friction))
     for velocity, paper in PURSUIT.items():
-        trapped = run_points(_setting(arguments, velocity))["pursuit"].trapped
-        rows.append(_row("pursuit", int(trapped.sum()), arguments, paper, velocity=velocity))
+        setting = _setting(arguments, arguments.pursuit_episodes, velocity)
+        rows.append(_row("pursuit", run_points(setting)["pursuit"].trapped, paper, velocity=velocity))
     return rows
 
 
-def _setting(arguments: Arguments, velocity: float, friction: float = 0.0) -> EvaluateArguments:
+def _setting(arguments: Arguments, episodes: int, velocity: float, friction: float = 0.0) -> EvaluateArguments:
     return EvaluateArguments(
-        planners=("pursuit",), velocity=velocity, friction=friction, episodes=arguments.episodes,
+        planners=("pursuit",), velocity=velocity, friction=friction, episodes=episodes,
         split=arguments.split, seed=arguments.seed, num_envs=arguments.num_envs,
     )  # fmt: skip
 
 
-def _solvable(arguments: Arguments, velocity: float, friction: float = 0.0) -> int:
-    _, solvable = record_truth(_setting(arguments, velocity, friction))
-    return int(solvable.sum())
+def _solvable(arguments: Arguments, velocity: float, friction: float = 0.0) -> Tensor:
+    _, solvable = record_truth(_setting(arguments, arguments.episodes, velocity, friction))
+    return solvable
 
 
-def _row(
-    what: str, count: int, arguments: Arguments, paper: float, *, velocity: float, friction: float = 0.0
-) -> dict[str, Any]:
-    share = rate(count, arguments.episodes)
-    row = {"what": what, "velocity": velocity, "friction": friction, "episodes": arguments.episodes}
+def _row(what: str, successes: Tensor, paper: float, *, velocity: float, friction: float = 0.0) -> dict[str, Any]:
+    share = rate(int(successes.sum()), len(successes))
+    row = {"what": what, "velocity": velocity, "friction": friction, "episodes": len(successes)}
     row |= {"ours": share.value, "ci": [share.low, share.high], "paper": paper, "difference": share.value - paper}
-    print(
-        f"{what:9} {velocity:g} m/s {friction:g} N: {share.value:.3f}, paper {paper:.2f} ({share.value - paper:+.3f})"
-    )
+    gap = share.value - paper
+    print(f"{what:9} {velocity:g} m/s {friction:g} N: {share.value:.3f}, paper {paper:.2f} ({gap:+.3f})")
     return row
 
 

@@ -2,6 +2,7 @@ import pytest
 import torch
 from tensordict import TensorDict
 from torchrl.collectors import Collector
+from torchrl.envs import EnvBase
 
 from torchdyn_plan.envs import TrapperEnv, TrapperScene
 from torchdyn_plan.envs.trapper import HOLD_STEPS
@@ -130,6 +131,18 @@ def test_auto_reset_goes_on_with_the_next_episodes():
         data, td = env.step_and_maybe_reset(wave(td))
         rows.append(data.clone())
     assert_as_if_alone(torch.stack(rows, dim=1), 12, max_steps=9)
+
+
+def test_a_step_with_resets_is_torchrls_own():
+    planner, (ours, theirs) = TargetPursuit(IKPlanner()), (make_env(3, max_steps=5) for _ in range(2))
+    own, other = ours.reset(), theirs.reset()
+    for _ in range(12):
+        own = ours.step_and_maybe_reset(planner(own))
+        other = EnvBase.step_and_maybe_reset(theirs, planner(other))
+        for one, two in zip(own, other, strict=True):
+            assert set(one.keys(include_nested=True)) == set(two.keys(include_nested=True))
+            assert same(one, two)
+        own, other = own[1], other[1]
 
 
 def test_a_collector_gathers_whole_episodes():

@@ -47,14 +47,14 @@ def test_mujoco_alone_repeats_the_loop_bit_for_bit_through_resets():
 
 
 def test_a_tape_holds_every_reset():
-    env = bench_env._taped_env(6, 1)
+    env, taped = bench_env._taped_env(6, 1)
     log = EpisodeLog.empty(60)
     loop = play(TargetPursuit(IKPlanner(chunk=16)), env, log)
     for _ in range(330):
         next(loop)
     assert log.done.any()
-    assert len(env.simulation.tape) == 330
-    resets = [reset for entry in env.simulation.tape for reset in entry.resets] + env.simulation.pending
+    assert len(taped.tape) == 330
+    resets = [reset for entry in taped.tape for reset in entry.resets] + taped.pending
     assert sum(len(reset.rows) for reset in resets) == 6 + int(log.done.sum())
 
 

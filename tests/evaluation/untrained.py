@@ -8,5 +8,6 @@ from torchdyn_plan.planners import DynamicPlanner, IKPlanner
 
 def untrained(**settings):
     torch.manual_seed(0)
-    nets = Forecaster(hidden=8, channels=4).eval(), ETANetwork(hidden=8).eval()
+    # Narrower ones take kernels whose last bit depends on a row's place in the block.
+    nets = Forecaster(hidden=64).eval(), ETANetwork(hidden=64).eval()
     return DynamicPlanner(IKPlanner(chunk=8), *nets, chunk=8, **settings).requires_grad_(False)

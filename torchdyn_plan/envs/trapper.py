@@ -159,8 +159,7 @@ class TrapperEnv(EnvBase):
         after = self._step(tensordict)
         tensordict.set("next", after)
         entries = dict(tensordict.items()) | dict(after.items())
-        for key in ("next", "reward", keys.ACTION):
-            entries.pop(key, None)
+        del entries["next"], entries["reward"]
         onward = TensorDict(entries, batch_size=self.batch_size, device=self.device)
         done = after["done"]
         if done.any():

@@ -112,17 +112,17 @@ def bench(
     with one_thread(), torch.no_grad(), tqdm(total=total, desc="env", unit="step", leave=False) as bar:
         for size in sizes:
             for what in ("random", *makers):
-                env = _taped_env(size, threads)
+                env, taped = _taped_env(size, threads)
                 loop = _random(env) if what == "random" else play(makers[what](), env, EpisodeLog.empty(10 * size))
-                raw, taken, error = _take_turns(loop, env, steps, bar.update)
+                raw, taken, error = _take_turns(loop, taped, steps, bar.update)
                 rows += _rows(what, env, raw, taken, error)
     return rows
 
 
-def _taped_env(size: int, threads: int) -> TrapperEnv:
+def _taped_env(size: int, threads: int) -> tuple[TrapperEnv, TapedSimulation]:
     env = TrapperEnv(size, velocity=VELOCITY, split="dev", num_threads=threads)
-    env.simulation = TapedSimulation(size, env.scene, num_threads=threads)
-    return env
+    env.simulation = taped = TapedSimulation(size, env.scene, num_threads=threads)
+    return env, taped
 
 
 def _random(env: TrapperEnv) -> Iterator[None]:
@@ -136,11 +136,9 @@ def _random(env: TrapperEnv) -> Iterator[None]:
 
 
 def _take_turns(
-    loop: Iterator[object], env: TrapperEnv, steps: int, progress: Callable[[int], object]
+    loop: Iterator[object], taped: TapedSimulation, steps: int, progress: Callable[[int], object]
 ) -> tuple[list[float], list[float], float]:
     """Durations of each step [s] of MuJoCo alone and of ``loop``, and the greatest difference of their positions."""
-    taped = env.simulation
-    assert isinstance(taped, TapedSimulation)
     alone, raw, taken, error = RawSimulation(taped), [], [], 0.0
     while len(taken) < steps:
         count = min(BLOCK, steps - len(taken))

@@ -67,7 +67,7 @@ def _row(what: str, part: Part, seen: TensorDictBase, device: str, seconds: floa
 
 def _error(part: Part, seen: TensorDictBase) -> float:
     """Greatest difference between the first rows of a batch and the same rows one by one."""
-    singles = [part(row) for row in seen[:SINGLES].split(1)]
+    singles = [part(seen[row : row + 1]) for row in range(min(SINGLES, len(seen)))]
     pairs = zip(part(seen), map(torch.cat, zip(*singles, strict=True)), strict=True)
     return max(float((whole[: len(single)].double() - single.double()).abs().max()) for whole, single in pairs)
 
