@@ -53,20 +53,20 @@ def run(env: TrapperEnv, planner: DynamicPlanner, episode: int) -> tuple[bool, l
         state = step_mdp(state)
 
 
-def main(file: str, before: int = 45) -> None:
+def main(file: str, before: int = 110) -> None:
     """Draw the first trap that comes after a bounce and a long way, ``before`` steps before it."""
     env, planner = TrapperEnv(1, velocity=3.0, split="dev"), DynamicPlanner.from_pretrained("trapper-ik")
     for episode in range(100):
         trapped, scenes, meetings = run(env, planner, episode)
         path = np.array(scenes)[:, :3]
-        if trapped and len(path) > 150 and np.ptp(path[:, :2], axis=0).min() > 0.5:
+        if trapped and len(path) > 260 and np.ptp(path[:, :2], axis=0).min() > 0.5:
             break
     model = env.simulation.model
     data = mujoco.MjData(model)
     data.qpos[:] = scenes[-before]
     mujoco.mj_forward(model, data)
     camera = mujoco.MjvCamera()
-    camera.lookat[:], camera.distance, camera.azimuth, camera.elevation = (0.0, -0.1, 0.0), 2.5, 135.0, -42.0
+    camera.lookat[:], camera.distance, camera.azimuth, camera.elevation = (0.0, 0.0, -0.1), 2.7, 150.0, -48.0
     with mujoco.Renderer(model, 720, 1280) as renderer:
         renderer.update_scene(data, camera)
         draw_line(renderer.scene, path[: len(path) - before : 4], YELLOW, 0.008)

@@ -1,5 +1,7 @@
 """What every published figure rests on. None of it may change, least of all to help a planner."""
 
+import math
+
 import mujoco
 import numpy as np
 import pytest
@@ -8,6 +10,7 @@ import torch
 from torchdyn_plan.envs import TrapperScene, TrapperSimulation
 from torchdyn_plan.envs.episodes import draw_starts
 from torchdyn_plan.envs.trapper import HOLD_STEPS, MAX_STEPS
+from torchdyn_plan.errors import InputError
 
 FROZEN = "this is frozen: with it changed, no result can be compared with an earlier one or with the paper"
 SCENE = TrapperScene()
@@ -82,3 +85,31 @@ def test_an_episode_starts_alike_whatever_is_drawn_beside_it_and_in_proportion_t
     place, velocity = draw_starts(SCENE, torch.tensor([2, 0]), velocity=1.5, split="test", seed=0)
     torch.testing.assert_close(place.tolist(), [PLACES[2], PLACES[0]], rtol=0, atol=1e-12)
     torch.testing.assert_close((2 * velocity).tolist(), [VELOCITIES[2], VELOCITIES[0]], rtol=0, atol=1e-12)
+
+
+@pytest.mark.parametrize(
+    ("name", "value", "message"),
+    [
+        ("table_side", 0, "table_side must be >= 1e-09, got 0"),
+        ("ball_mass", -6, "ball_mass must be >= 1e-09, got -6"),
+        ("ball_mass", True, "ball_mass must be a finite number, got True"),
+        ("base_height", math.nan, "base_height must be a finite number, got nan"),
+        ("rolling_resistance", math.nan, "rolling_resistance must be a finite number, got nan"),
+        ("rolling_resistance", -1e-4, "rolling_resistance must be >= 0, got -0.0001"),
+        ("home", (0.0,) * 5 + (math.nan,), "home must be a finite number, got nan"),
+        ("home", (0.0,) * 5, "home must be a tuple of 6 numbers"),
+        ("home", [0.0] * 6, "home must be a tuple of 6 numbers"),
+        ("servo_stiffness", (8000.0,) * 5 + (0,), "servo_stiffness must be >= 1e-09, got 0"),
+        ("servo_damping", (400.0,) * 5 + (math.inf,), "servo_damping must be a finite number, got inf"),
+        ("servo_damping", 400.0, "servo_damping must be a tuple of 6 numbers, got 400.0"),
+    ],
+)
+def test_another_scene_that_cannot_be_is_refused(name, value, message):
+    with pytest.raises(InputError, match=message):
+        TrapperScene(**{name: value})
+
+
+def test_another_scene_may_have_whole_numbers_a_sunk_base_and_no_rolling_resistance():
+    other = TrapperScene(table_side=2, base_height=-0.1, rolling_resistance=0)
+    assert other.half_side == 1.0
+    assert other.digest() != SCENE.digest()

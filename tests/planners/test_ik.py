@@ -21,7 +21,13 @@ def test_planner_and_scene_agree_on_every_number_they_share():
     assert APPROACH.clear_height <= APPROACH.travel_height
     assert APPROACH.table_height >= SCENE.ball_radius
     assert 0 < APPROACH.down_height < SCENE.ball_radius
-    assert APPROACH.drop_distance < SCENE.box_half_width - SCENE.ball_radius + 0.005
+    # A box that drops from there, straight at its goal, comes down past a ball at rest without touching it.
+    lift = APPROACH.travel_height - APPROACH.down_height
+    away = torch.linspace(0.0, APPROACH.drop_distance, 50, dtype=torch.float64)
+    mouth = APPROACH.down_height + lift * away / APPROACH.drop_distance
+    wall = (SCENE.box_half_width - away).clamp_min(0.0)
+    ball = SCENE.ball_radius + (SCENE.ball_radius**2 - wall**2).clamp_min(0.0).sqrt()
+    assert (mouth - ball)[wall < SCENE.ball_radius].min() > 0
     assert APPROACH.max_radius < 0.425 + 0.39225 + 0.10915
     here = tool(home())
     assert here[2] >= APPROACH.clear_height
