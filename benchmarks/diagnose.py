@@ -18,7 +18,7 @@ from torchdyn_plan.envs.scene import TrapperScene
 from torchdyn_plan.evaluation.measured import MeasuredArrival
 from torchdyn_plan.evaluation.paper import paper_rate
 from torchdyn_plan.evaluation.results import summarize
-from torchdyn_plan.evaluation.run import CHUNK, IK_CHUNK, record_truth, run_episodes
+from torchdyn_plan.evaluation.run import IK_CHUNK, record_truth, run_episodes
 from torchdyn_plan.files import write_json
 from torchdyn_plan.planners import CornerSearch, DynamicPlanner, IKPlanner
 from torchdyn_plan.planners.baselines import RecordedFuture
@@ -41,7 +41,7 @@ class Arguments:
 
 def planners() -> dict[str, DynamicPlanner]:
     """Every combination of learned and true parts."""
-    learned = DynamicPlanner.from_pretrained("trapper-ik", chunk=CHUNK)
+    learned = DynamicPlanner.from_pretrained("trapper-ik", chunk=IK_CHUNK)
     forecasts = {"network": learned.forecaster, "truth": RecordedFuture()}
     arrivals = {
         "network": (learned.eta, "mode"),
@@ -50,7 +50,7 @@ def planners() -> dict[str, DynamicPlanner]:
     }
     return {
         f"{forecast} | {arrival}": DynamicPlanner(
-            IKPlanner(chunk=IK_CHUNK), forecasts[forecast], eta, search=CornerSearch(reading=reading), chunk=CHUNK
+            IKPlanner(chunk=IK_CHUNK), forecasts[forecast], eta, search=CornerSearch(reading=reading), chunk=IK_CHUNK
         )
         for forecast in forecasts
         for arrival, (eta, reading) in arrivals.items()

@@ -77,4 +77,4 @@ class OracleTrajectory(DynamicPlanner):
     def from_pretrained(cls, name: str, *, chunk: int | None = None) -> OracleTrajectory:
         """The planner of that name with the recorded truth in place of its forecaster; raises what that one raises."""
         planner = DynamicPlanner.from_pretrained(name, chunk=chunk)
-        return cls(planner.static, planner.eta, chunk=chunk)
+        return cls(planner.static, planner.eta, chunk=chunk).eval().requires_grad_(False)
