@@ -31,7 +31,7 @@ FRICTION = {0.0: 0.78, 2.5: 0.78, 5.0: 0.76, 7.5: 0.68, 9.5: 0.64}
 class Arguments:
     """Measure the calibration figures of the scene."""
 
-    episodes: int = 4000
+    episodes: int = 2000
     """Episodes a point for solvable shares."""
     pursuit_episodes: int = 1000
     """Episodes a point for target pursuit."""

@@ -30,8 +30,7 @@ def draw_line(scene: mujoco.MjvScene, points: np.ndarray, colour: tuple[float, .
 
 def draw_ball(scene: mujoco.MjvScene, place: np.ndarray, colour: tuple[float, ...], radius: float) -> None:
     """Add a sphere at ``place`` (3,) [m]."""
-    geom, size = scene.geoms[scene.ngeom], np.full(3, radius)
-    kind = mujoco.mjtGeom.mjGEOM_SPHERE
+    geom, size, kind = scene.geoms[scene.ngeom], np.full(3, radius), mujoco.mjtGeom.mjGEOM_SPHERE
     mujoco.mjv_initGeom(geom, kind, size, place, np.eye(3).ravel(), np.array(colour, np.float32))
     scene.ngeom += 1
 

@@ -1,0 +1,21 @@
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+EXAMPLES = Path(__file__).parent.parent / "examples"
+
+
+@pytest.mark.parametrize(
+    ("name", "says"), [("01_trap_a_ball.py", "DynamicPlanner  traps"), ("02_own_static_planner.py", "target 0.0")]
+)
+def test_example_runs(name, says):
+    run = subprocess.run([sys.executable, EXAMPLES / name], capture_output=True, text=True, check=False, timeout=300)
+    assert run.returncode == 0, run.stderr
+    assert says in run.stdout
+
+
+def test_examples_are_short():
+    for file in EXAMPLES.glob("*.py"):
+        assert len(file.read_text().splitlines()) <= 80, file.name
