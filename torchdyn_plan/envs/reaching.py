@@ -17,7 +17,7 @@ from torchdyn_plan.kinematics.arm import Arm
 
 
 class ReachingTask:
-    """``num_envs`` arms with a goal each; the ball lies parked behind a far rail's pocket-free middle.
+    """``num_envs`` arms with a goal each; the ball lies parked before the far rail, out of the arms' reach.
 
     The static planner is any callable from tensordict to tensordict that reads the robot's state and ``goal`` and
     writes ``action``: the task only runs it and looks.
