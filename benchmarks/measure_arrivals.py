@@ -9,7 +9,7 @@ import torch
 import tyro
 
 from torchdyn_plan.envs.scene import TrapperScene
-from torchdyn_plan.evaluation.run import STATICS
+from torchdyn_plan.evaluation.run import static_planner
 from torchdyn_plan.evaluation.solvability import SHIPPED, arrivals_name, measure_arrivals, save_arrivals
 
 
@@ -25,7 +25,7 @@ def main(arguments: Arguments) -> None:
     """Measure and write into the package."""
     torch.set_num_threads(1)
     scene = TrapperScene()
-    arrivals = measure_arrivals(STATICS[arguments.static](), scene)
+    arrivals = measure_arrivals(static_planner(arguments.static), scene)
     save_arrivals(arrivals, SHIPPED / arrivals_name(arguments.static, scene))
 
 

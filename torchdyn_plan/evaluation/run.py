@@ -22,7 +22,7 @@ from torchdyn_plan.evaluation.plots import plot_results
 from torchdyn_plan.evaluation.report import format_table
 from torchdyn_plan.evaluation.results import EpisodeOutcomes, summarize, write_results
 from torchdyn_plan.evaluation.solvability import arrival_map, is_solvable, record_path
-from torchdyn_plan.planners import DynamicPlanner, IKPlanner, OracleTrajectory, TargetPursuit
+from torchdyn_plan.planners import STATIC_PLANNERS, DynamicPlanner, IKPlanner, OracleTrajectory, TargetPursuit
 
 Planner = Callable[[TensorDictBase], TensorDictBase]
 
@@ -33,19 +33,22 @@ IK_CHUNK = 64
 HORIZON = 300
 """Control steps that the recorded truth goes on after the end of an episode."""
 
-STATICS: dict[str, Callable[[], Planner]] = {"ik": lambda: IKPlanner(chunk=IK_CHUNK)}
-"""The static planners by name."""
 PLANNERS: dict[str, Callable[[str], Planner]] = {
-    "pursuit": lambda static: TargetPursuit(STATICS[static]()),
+    "pursuit": lambda static: TargetPursuit(static_planner(static)),
     "corner": lambda static: _pretrained(DynamicPlanner, static),
     "oracle": lambda static: _pretrained(OracleTrajectory, static),
 }
 """The planners for a moving target by name, on the static planner of a given name."""
 
 
+def static_planner(name: str) -> IKPlanner:
+    """The static planner of that name, whose results do not depend on the number of environments."""
+    return STATIC_PLANNERS[name](chunk=IK_CHUNK)
+
+
 def _pretrained(kind: type[DynamicPlanner], static: str) -> DynamicPlanner:
     planner = kind.from_pretrained(f"trapper-{static}", chunk=CHUNK)
-    planner.static = STATICS[static]()
+    planner.static = static_planner(static)
     return planner
 
 
@@ -73,7 +76,7 @@ def run_points(arguments: EvaluateArguments) -> dict[str, EpisodeOutcomes]:
 def record_truth(arguments: EvaluateArguments) -> tuple[Tensor, Tensor]:
     """Recorded future ``(E, T, 3)`` of every episode's ball, and which episodes are solvable ``(E,)``."""
     scene, threads = TrapperScene(), arguments.threads
-    arrivals = arrival_map(arguments.static, STATICS[arguments.static](), scene, num_threads=threads)
+    arrivals = arrival_map(arguments.static, static_planner(arguments.static), scene, num_threads=threads)
     place, velocity = draw_starts(
         scene, torch.arange(arguments.episodes), velocity=arguments.velocity, split=arguments.split, seed=arguments.seed
     )

@@ -2,13 +2,14 @@
 
 from torchdyn_plan.planners.baselines import OracleTrajectory, TargetPursuit
 from torchdyn_plan.planners.callable import CallablePlanner
-from torchdyn_plan.planners.dynamic import DynamicPlanner
+from torchdyn_plan.planners.dynamic import STATIC_PLANNERS, DynamicPlanner
 from torchdyn_plan.planners.ik import IKPlanner
 from torchdyn_plan.planners.protocol import StaticPlanner
 from torchdyn_plan.planners.schedule import ReplanSchedule
 from torchdyn_plan.planners.search import CornerSearch, SearchResult, search_corners
 
 __all__ = [
+    "STATIC_PLANNERS",
     "CallablePlanner",
     "CornerSearch",
     "DynamicPlanner",

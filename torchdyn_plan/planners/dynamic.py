@@ -19,6 +19,8 @@ from torchdyn_plan.planners.rows import apply_to_rows
 from torchdyn_plan.planners.schedule import ReplanSchedule
 from torchdyn_plan.planners.search import CornerSearch, SearchResult
 
+STATIC_PLANNERS = {"ik": IKPlanner}
+"""The static planners that ship, by name."""
 PRETRAINED = {"trapper-ik": (IKPlanner, "trapper", "trapper-ik")}
 """Name → class of the static planner, name of the forecaster's weights, name of the ETA network's weights."""
 

@@ -3,14 +3,13 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
 import torch
 from safetensors import SafetensorError, safe_open
 from safetensors.torch import save_file
-from tensordict import TensorDictBase
 from torch import Tensor
 
 from torchdyn_plan.cli_arguments import CollectArguments
@@ -21,7 +20,7 @@ from torchdyn_plan.envs.simulation import TrapperSimulation
 from torchdyn_plan.envs.trapping import is_pocketed
 from torchdyn_plan.errors import InputError
 from torchdyn_plan.files import write_json, write_whole
-from torchdyn_plan.planners.ik import IKPlanner
+from torchdyn_plan.planners import STATIC_PLANNERS
 from torchdyn_plan.training.runs import record_runs
 from torchdyn_plan.versions import library_versions
 
@@ -29,7 +28,6 @@ PATH_STEPS = 2000
 """Control steps of a recorded path: four times an episode (paper, Section IV)."""
 FASTEST = 5.0
 """Balls start with velocities up to this [m/s]."""
-STATIC_PLANNERS: dict[str, Callable[[], Callable[[TensorDictBase], TensorDictBase]]] = {"ik": IKPlanner}
 
 
 def collect(arguments: CollectArguments) -> None:
