@@ -24,7 +24,7 @@ MAX_STEPS = 500
 """Control steps of an episode: two seconds."""
 
 ROWS = 64
-"""Arms whose kinematics are computed at a time."""
+"""Kinematics are computed for a multiple of so many arms."""
 
 
 class TrapperEnv(EnvBase):
@@ -85,6 +85,9 @@ class TrapperEnv(EnvBase):
         self._steps = torch.zeros(num_envs, dtype=torch.int64)
         self._held = torch.zeros(num_envs, dtype=torch.int64)
         self._trace = torch.zeros(num_envs, history, 3)
+        home = torch.tensor(self.scene.home, dtype=torch.float64)
+        self._home_tool_pos = self._tool(home.expand(num_envs, -1))[0][0]
+        self._tool_pos = self._home_tool_pos.repeat(num_envs, 1)
         self._make_specs(num_envs, history)
 
     def _make_specs(self, n: int, history: int) -> None:
@@ -129,8 +132,9 @@ class TrapperEnv(EnvBase):
             # A copy: what an earlier step returned shares the old one.
             self._trace = self._trace.clone()
             self._trace[rows] = self.simulation.ball_pos[rows].float().unsqueeze(1)
-        tool = self._tool()[0]
-        result = self._observe(tool, torch.zeros(self.num_envs, dtype=torch.bool))
+            self._tool_pos = self._tool_pos.clone()
+            self._tool_pos[rows] = self._home_tool_pos
+        result = self._observe(torch.zeros(self.num_envs, dtype=torch.bool))
         for key in ("done", "terminated", "truncated"):
             result[key] = torch.zeros(self.num_envs, 1, dtype=torch.bool)
         return result
@@ -143,11 +147,11 @@ class TrapperEnv(EnvBase):
         self._steps += 1
         ball = self.simulation.ball_pos.float()
         self._trace = torch.cat([self._trace[:, 1:], ball.unsqueeze(1)], dim=1)
-        tool, rotation = self._tool()
-        covered = is_covered(self.scene, tool, rotation, ball)
+        self._tool_pos, rotation = self._tool(self.simulation.joint_pos)
+        covered = is_covered(self.scene, self._tool_pos, rotation, ball)
         self._held = torch.where(covered, self._held + 1, 0)
         trapped = self._held >= HOLD_STEPS
-        result = self._observe(tool, trapped)
+        result = self._observe(trapped)
         terminated = result[keys.TRAPPED] | result[keys.POCKETED]
         truncated = (self._steps >= self.max_steps).unsqueeze(-1)
         result["reward"] = trapped.float().unsqueeze(-1)
@@ -166,16 +170,16 @@ class TrapperEnv(EnvBase):
             onward.update(self._reset(TensorDict({"_reset": done}, batch_size=self.batch_size)))
         return tensordict, onward
 
-    def _tool(self) -> tuple[Tensor, Tensor]:
-        """Place (N, 3) [m, world] and rotation (N, 3, 3) of the box mouth."""
-        # Matrix products may differ in the last bit with the number of rows, so it is always the same.
-        padded = nn.functional.pad(self.simulation.joint_pos.float(), (0, 0, 0, -self.num_envs % ROWS))
-        pose = torch.cat([self._arm(block) for block in padded.split(ROWS)])[: self.num_envs]
+    def _tool(self, joint_pos: Tensor) -> tuple[Tensor, Tensor]:
+        """Place (N, 3) [m, world] and rotation (N, 3, 3) of the box mouth at joint angles (N, 6) [rad]."""
+        # Matrix products treat the last few rows in another way, with another last bit: these are padding.
+        padded = nn.functional.pad(joint_pos.float(), (0, 0, 0, -self.num_envs % ROWS))
+        pose = self._arm(padded)[: self.num_envs]
         return pose[:, :3, 3] + self._base, pose[:, :3, :3]
 
-    def _observe(self, tool: Tensor, trapped: Tensor) -> TensorDict:
+    def _observe(self, trapped: Tensor) -> TensorDict:
         joint_pos, joint_vel = self.simulation.joint_pos.float(), self.simulation.joint_vel.float()
-        target = self._trace[:, -1]
+        tool, target = self._tool_pos, self._trace[:, -1]
         state = torch.cat([joint_pos, joint_vel, tool], dim=-1)
         entries = {
             keys.JOINT_POS: joint_pos, keys.JOINT_VEL: joint_vel, keys.TOOL_POS: tool, keys.TARGET_POS: target,

@@ -111,7 +111,9 @@ def _parts(planner: DynamicPlanner) -> dict[str, Part]:
 
     def search(seen: TensorDictBase) -> tuple[Tensor, ...]:
         here = seen[keys.TARGET_POS]
-        forecast = here.unsqueeze(1) + seen[keys.TARGET_HISTORY].diff(dim=1)[:, -1:] * forecaster.steps_ahead
+        forecast = here.unsqueeze(1) + seen[keys.TARGET_HISTORY].diff(dim=1)[:, -1:] * forecaster.steps_ahead.unsqueeze(
+            -1
+        )
         return planner.search(forecast, here, _constant_arrival)[:2]
 
     return {

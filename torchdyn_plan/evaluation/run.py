@@ -22,11 +22,20 @@ from torchdyn_plan.evaluation.plots import plot_results
 from torchdyn_plan.evaluation.report import format_table
 from torchdyn_plan.evaluation.results import EpisodeOutcomes, summarize, write_results
 from torchdyn_plan.evaluation.solvability import arrival_map, is_solvable, record_path
-from torchdyn_plan.planners import STATIC_PLANNERS, DynamicPlanner, IKPlanner, OracleTrajectory, TargetPursuit
+from torchdyn_plan.planners import (
+    STATIC_PLANNERS,
+    DynamicPlanner,
+    ExactSearch,
+    IKPlanner,
+    MeetingPlanner,
+    OracleTrajectory,
+    TargetPursuit,
+)
+from torchdyn_plan.planners.protocol import GoalSearch
 
 Planner = Callable[[TensorDictBase], TensorDictBase]
 
-CHUNK = 16
+CHUNK = 32
 """Rows that a network sees at once, whatever the number of environments: few, as few plan at the same step."""
 IK_CHUNK = 64
 """Rows that the inverse kinematics sees at once, whatever the number of environments."""
@@ -37,6 +46,8 @@ PLANNERS: dict[str, Callable[[str], Planner]] = {
     "pursuit": lambda static: TargetPursuit(static_planner(static)),
     "corner": lambda static: _pretrained(DynamicPlanner, static),
     "oracle": lambda static: _pretrained(OracleTrajectory, static),
+    "exact": lambda static: _pretrained(DynamicPlanner, static, search=ExactSearch()),
+    "meet": lambda static: _pretrained(MeetingPlanner, static),
 }
 """The planners for a moving target by name, on the static planner of a given name."""
 
@@ -46,9 +57,9 @@ def static_planner(name: str) -> IKPlanner:
     return STATIC_PLANNERS[name](chunk=IK_CHUNK)
 
 
-def _pretrained(kind: type[DynamicPlanner], static: str) -> DynamicPlanner:
+def _pretrained(kind: type[DynamicPlanner], static: str, *, search: GoalSearch | None = None) -> DynamicPlanner:
     planner = kind.from_pretrained(f"trapper-{static}", chunk=CHUNK)
-    planner.static = static_planner(static)
+    planner.static, planner.search = static_planner(static), search or planner.search
     return planner
 
 

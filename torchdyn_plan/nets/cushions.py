@@ -12,8 +12,7 @@ def fold(unfolded: Tensor, half_extent: float) -> Tensor:
         half_extent: L, where the path is mirrored: at -L and L [m].
 
     Returns:
-        ``(*B,)`` coordinates within [-L, L] [m]; an odd function whose slope is 1 or -1 everywhere.
+        ``(*B,)`` coordinates within [-L, L] [m]; an odd function (but for rounding) whose slope is 1 or -1.
     """
-    branch = torch.round(unfolded / (2 * half_extent))
-    inside = unfolded - 2 * half_extent * branch
-    return torch.where(branch % 2 == 0, inside, -inside)
+    period = 4 * half_extent
+    return half_extent - (torch.remainder(unfolded + half_extent, period) - period / 2).abs()

@@ -162,9 +162,9 @@ def decode_expectation(logits: Tensor, *, bin_width: int = 5) -> Arrival:
     """
     bins = logits.shape[-1] - 1
     share = logits.softmax(dim=-1)
+    arrives, never = share[..., :bins], share[..., bins]
     middle = bin_width * torch.arange(bins, device=logits.device, dtype=logits.dtype) + (bin_width - 1) / 2
-    arrives = logits[..., :bins].softmax(dim=-1)
-    return Arrival((arrives * middle).sum(dim=-1), share[..., bins] > 0.5)
+    return Arrival((arrives @ middle) / (1.0 - never).clamp_min(1e-12), never > 0.5)
 
 
 READINGS = {"mode": decode_mode, "expectation": decode_expectation}

@@ -25,8 +25,10 @@ class ForecasterConfig:
     """Features of a step after embedding and after each convolution."""
     convolutions: int = 3
     """Convolutions over the history, each of stride 2."""
-    hidden: int = 512
+    hidden: int = 384
     """Width of the two layers between convolutions and head."""
+    rank: int = 64
+    """Rank of the head: forecasts are mixtures of that many shapes of path, which are learned."""
     step_scale: float = 0.02
     """Length of a step that counts as one [m]: fast motion over one control step."""
     length_scale: float = 0.75
@@ -42,7 +44,7 @@ class ForecasterConfig:
 
     def __post_init__(self) -> None:
         check_number("history", self.history, minimum=2, integer=True)
-        for name in ("horizon", "channels", "convolutions", "hidden"):
+        for name in ("horizon", "channels", "convolutions", "hidden", "rank"):
             check_number(name, getattr(self, name), minimum=1, integer=True)
         for name in ("step_scale", "length_scale", "height_scale", "change_scale"):
             check_number(name, getattr(self, name), minimum=1e-9)
@@ -64,6 +66,8 @@ class Forecaster(Pretrained, nn.Module):
     config_type = ForecasterConfig
     symmetries: Tensor
     steps_ahead: Tensor
+    _time: Tensor
+    _scale: Tensor
 
     def __init__(self, config: ForecasterConfig | None = None, **settings: Any) -> None:
         """Build the network from ``config``, or from the fields of `ForecasterConfig` given as keywords."""
@@ -78,12 +82,16 @@ class Forecaster(Pretrained, nn.Module):
             length = (length + 1) // 2
         self.join = nn.Linear(channels * length + self._present_size, config.hidden)
         self.hidden = nn.Linear(config.hidden, config.hidden)
-        self.head = nn.Linear(config.hidden, 3 * config.horizon)
+        self.mix = nn.Linear(config.hidden, config.rank)
+        self.head = nn.Linear(config.rank, 3 * config.horizon)
         nn.init.zeros_(self.head.bias)
         self.head.weight.data.mul_(0.1)
         self.register_buffer("symmetries", square_symmetries(), persistent=False)
-        steps = torch.arange(1.0, config.horizon + 1.0).unsqueeze(-1)
+        steps = torch.arange(1.0, config.horizon + 1.0)
+        level, height = config.step_scale * steps, torch.full_like(steps, config.height_scale)
         self.register_buffer("steps_ahead", steps, persistent=False)
+        self.register_buffer("_time", torch.stack([steps, steps, torch.zeros_like(steps)]), persistent=False)
+        self.register_buffer("_scale", torch.stack([level, level, height]), persistent=False)
 
     def forward(self, target_history: Tensor) -> Tensor:
         """Positions at the next F control steps.
@@ -99,36 +107,39 @@ class Forecaster(Pretrained, nn.Module):
         """
         if not torch.compiler.is_compiling():
             self._check(target_history)
-        line = self.unfolded(target_history)
-        if self.config.half_extent is None:
-            return line
-        return torch.cat([fold(line[..., :2], self.config.half_extent), line[..., 2:]], dim=-1)
+        turn, line = self._line(target_history)
+        if self.config.half_extent is not None:
+            level, height = line.split([2, 1], dim=-2)
+            line = torch.cat([fold(level, self.config.half_extent), height], dim=-2)
+        return line.mT if turn is None else (turn @ line).mT
 
     def unfolded(self, target_history: Tensor) -> Tensor:
         """Same as `forward` before cushions mirror the line: what training compares, ``(*B, F, 3)`` [m, world]."""
-        config = self.config
-        now = target_history[..., -1:, :]
-        step = target_history.diff(dim=-2)
-        if not config.square_symmetry:
-            return now + self._departure(now, step)
-        # A pinch of position decides for a target that moves along an axis or lies still.
-        direction = step[..., -1, :2] + 1e-6 * now[..., 0, :2]
-        turn = self.symmetries[octant(direction)]
-        return now + self._departure(now @ turn, step @ turn) @ turn.mT
+        turn, line = self._line(target_history)
+        return line.mT if turn is None else (turn @ line).mT
 
-    def _departure(self, now: Tensor, step: Tensor) -> Tensor:
-        """Displacements ``(*B, F, 3)`` from the newest position ``(*B, 1, 3)`` after the steps ``(*B, H-1, 3)`` [m]."""
+    def _line(self, target_history: Tensor) -> tuple[Tensor | None, Tensor]:
+        """Unfolded line (*B, 3, F) of the turned history, and the matrix (*B, 3, 3) that turns it back."""
+        now, step = target_history[..., -1, :], target_history.diff(dim=-2)
+        if not self.config.square_symmetry:
+            return None, self._line_ahead(now, step)
+        # A pinch of position decides for a target that moves along an axis or lies still.
+        direction = step[..., -1, :2] + 1e-6 * now[..., :2]
+        turn = self.symmetries[octant(direction)]
+        return turn, self._line_ahead((now.unsqueeze(-2) @ turn).squeeze(-2), step @ turn)
+
+    def _line_ahead(self, now: Tensor, step: Tensor) -> Tensor:
+        """Positions ``(*B, 3, F)`` after the newest position ``(*B, 3)`` and the steps ``(*B, H-1, 3)`` [m]."""
         config, batch = self.config, step.shape[:-2]
-        features = self._step_features(step).reshape(-1, *step.shape[-2:-1], 7)
-        features = torch.relu(self.embed(features.mT))
-        for layer in self.convolve:
-            features = torch.relu(layer(features))
-        present = self._present_features(now.squeeze(-2), step[..., -1, :])
-        joined = torch.cat([features.reshape(*batch, -1), present], dim=-1)
+        features = self._step_features(step).reshape(-1, step.shape[-2], 7)
+        for layer in (self.embed, *self.convolve):
+            features = torch.relu(_convolve(features, layer))
+        present = self._present_features(now, step[..., -1, :])
+        joined = torch.cat([features.mT.reshape(*batch, -1), present], dim=-1)
         hidden = torch.relu(self.hidden(torch.relu(self.join(joined))))
-        out = self.head(hidden).unflatten(-1, (config.horizon, 3))
-        level = self.steps_ahead * (step[..., -1:, :2] + config.step_scale * out[..., :2])
-        return torch.cat([level, config.height_scale * out[..., 2:]], dim=-1)
+        departure = self.head(self.mix(hidden)).unflatten(-1, (3, config.horizon))
+        straight = torch.addcmul(now.unsqueeze(-1), step[..., -1, :].unsqueeze(-1), self._time)
+        return torch.addcmul(straight, departure, self._scale)
 
     def _step_features(self, step: Tensor) -> Tensor:
         """Each step, its difference from the newest one, and whether it is no padding, ``(*B, H-1, 7)``."""
@@ -160,6 +171,14 @@ class Forecaster(Pretrained, nn.Module):
         check_trailing_shape("target_history", target_history, self.config.history, 3)
         check_same_device("target_history", target_history, self.head.weight.device, type(self).__name__)
         check_finite("target_history", target_history)
+
+
+def _convolve(features: Tensor, layer: Any) -> Tensor:
+    """What ``layer`` makes of ``features`` (R, L, C), as a matrix product: faster for few rows and channels."""
+    size, stride, margin = layer.kernel_size[0], layer.stride[0], int(layer.padding[0])
+    padded = nn.functional.pad(features, (0, 0, margin, margin)) if margin else features
+    seen = padded.unfold(-2, size, stride).flatten(-2)
+    return nn.functional.linear(seen, layer.weight.flatten(1), layer.bias)
 
 
 def _direction(step: Tensor) -> Tensor:

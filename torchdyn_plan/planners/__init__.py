@@ -2,8 +2,11 @@
 
 from torchdyn_plan.planners.baselines import OracleTrajectory, TargetPursuit
 from torchdyn_plan.planners.callable import CallablePlanner
+from torchdyn_plan.planners.drop import Drop
 from torchdyn_plan.planners.dynamic import STATIC_PLANNERS, DynamicPlanner
+from torchdyn_plan.planners.exact import ExactSearch
 from torchdyn_plan.planners.ik import IKPlanner
+from torchdyn_plan.planners.meeting import MeetingPlanner
 from torchdyn_plan.planners.protocol import StaticPlanner
 from torchdyn_plan.planners.schedule import ReplanSchedule
 from torchdyn_plan.planners.search import CornerSearch, SearchResult, search_corners
@@ -12,8 +15,11 @@ __all__ = [
     "STATIC_PLANNERS",
     "CallablePlanner",
     "CornerSearch",
+    "Drop",
     "DynamicPlanner",
+    "ExactSearch",
     "IKPlanner",
+    "MeetingPlanner",
     "OracleTrajectory",
     "ReplanSchedule",
     "SearchResult",

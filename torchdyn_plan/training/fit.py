@@ -110,7 +110,7 @@ def line_loss(network: Forecaster, windows: Windows) -> Tensor:
     """
     device = network.head.weight.device
     difference = network.unfolded(windows.history.to(device)) - windows.future.to(device)
-    ahead = network.steps_ahead.squeeze(-1)
+    ahead = network.steps_ahead
     weight = windows.recorded.to(device) / (LEVEL_SCALE * (ahead + LEVEL_START))
     level = difference[..., :2].abs().sum(dim=-1).mul(weight).sum() / weight.numel()
     return level + difference[..., 2].abs().mean() / HEIGHT_SCALE

@@ -1,0 +1,146 @@
+"""The whole forecast searched at once: every time at which the target could be met, and the best of them."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import torch
+from torch import Tensor
+
+from torchdyn_plan.checks import check_number, check_trailing_shape
+from torchdyn_plan.planners.search import SearchResult
+
+if TYPE_CHECKING:
+    from torchdyn_plan.nets.eta import Arrival
+
+
+@dataclass(frozen=True, kw_only=True)
+class ExactSearch:
+    """Judges every ``stride``-th position of the forecast as a meeting place, in one pass of the arrival predictor.
+
+    A candidate at step t is *in time* when the robot, which needs e(t) steps, is there ``lead`` steps and a ``margin``
+    before the target comes, e(t) + lead + margin ≤ t. Of these the one with the highest score wins: a point for each
+    step that the target stays at the place (up to ``longest_stay``), less ``patience`` for each step of waiting, plus
+    ``loyalty`` for the meeting that was planned before, which also needs no margin. Equal scores go to the earliest.
+    With the defaults the first crossing of e(t) = t wins. If nothing is in time, the least late candidate gives the
+    goal, and `reachable` is false.
+    """
+
+    stride: int = 5
+    """Control steps between candidates; an arrival bin's width loses nothing."""
+    height: float | None = None
+    """Height of the goals, above the table to wait there [m]; None for the target's own."""
+    half_extent: float | None = None
+    """Goals are clamped to the square of this half-side, where the tool can be; None to leave them [m]."""
+    lead: float = 0.0
+    """Control steps that the robot needs from the goal to the target."""
+    margin: float = 0.0
+    """Control steps that the robot should be early."""
+    footprint: float = 0.0
+    """A target within this distance of the goal, along both axes, is at the place [m]; 0 judges no stays."""
+    longest_stay: int = 16
+    """Control steps; to stay longer is worth no more."""
+    patience: float = 0.02
+    """Score that a step of waiting costs."""
+    loyalty: float = 0.0
+    """Score of keeping the meeting planned before."""
+    arrived: float = 0.0
+    """A goal within this distance of the tool, sideways, is reached now [m]."""
+
+    def __post_init__(self) -> None:
+        check_number("stride", self.stride, minimum=1, integer=True)
+        check_number("longest_stay", self.longest_stay, minimum=1, integer=True)
+        for name in ("lead", "margin", "footprint", "patience", "loyalty", "arrived"):
+            check_number(name, getattr(self, name), minimum=0.0)
+
+    def __call__(
+        self,
+        forecast: Tensor,
+        target_pos: Tensor,
+        eta: Callable[..., Arrival],
+        *,
+        tool_pos: Tensor | None = None,
+        planned_steps: Tensor | None = None,
+    ) -> SearchResult:
+        """Choose a meeting.
+
+        Args:
+            forecast: ``(*B, F, 3)`` [m, world], target positions in 1 … F control steps.
+            target_pos: ``(*B, 3)`` [m, world], the target now.
+            eta: maps goals ``(*B, K, 3)`` to arrivals ``(*B, K)``; called once, with the keyword ``reading``.
+            tool_pos: ``(*B, 3)`` [m, world], to tell goals that are reached already; None to trust ``eta`` alone.
+            planned_steps: ``(*B,)`` control steps from now to the meeting planned before; None if there is none.
+
+        Returns:
+            The meeting; ``arrival_steps`` is when the target comes within the footprint.
+
+        Raises:
+            InputError: ``target_pos`` or ``forecast`` has another shape, or their batches differ.
+        """
+        check_trailing_shape("target_pos", target_pos, 3)
+        horizon = forecast.shape[-2] if forecast.ndim > 1 else 1
+        check_trailing_shape("forecast", forecast, *target_pos.shape[:-1], horizon, 3)
+        path = torch.cat([target_pos.unsqueeze(-2), forecast], dim=-2)
+        steps = torch.arange(min(2, horizon), horizon + 1, self.stride, device=path.device)
+        goals = self.goals(path[..., steps, :])
+        arrival = eta(goals, reading="expectation")
+        needed = arrival.steps.masked_fill(arrival.never, torch.inf)
+        if tool_pos is not None and self.arrived > 0.0:
+            away = (goals - tool_pos.unsqueeze(-2))[..., :2].square().sum(-1)
+            needed = needed.masked_fill(away < self.arrived**2, 0.0)
+
+        before, stay = self.stays(path, goals, steps)
+        comes = steps - before
+        score = stay.to(path.dtype) - self.patience * steps
+        early = comes - self.lead - needed
+        slack = early - self.margin
+        if planned_steps is not None:
+            kept = (comes - planned_steps.unsqueeze(-1)).abs() <= self.stride + 1
+            score, slack = score + self.loyalty * kept, torch.where(kept, early, slack)
+        on_table = path[..., steps, 2] > 0.0
+        in_time = (slack >= 0.0) & (stay > 0) & on_table
+        nothing = ~in_time.any(dim=-1, keepdim=True)
+        late = slack.clamp(min=-1e6) + torch.where(on_table & (stay > 0), 0.0, -1e4)
+        score = torch.where(nothing, late, score.masked_fill(~in_time, -torch.inf))
+        best = score.argmax(dim=-1, keepdim=True)
+        return SearchResult(
+            goal=goals.gather(-2, best.unsqueeze(-1).expand(*best.shape, 3)).squeeze(-2),
+            arrival_steps=comes.gather(-1, best).squeeze(-1),
+            clamped=torch.zeros_like(nothing).squeeze(-1),
+            reachable=~nothing.squeeze(-1),
+        )
+
+    def goals(self, places: Tensor) -> Tensor:
+        """Where the tool is sent to meet a target at ``places`` (*B, 3) [m, world]."""
+        if self.half_extent is not None:
+            level = places[..., :2].clamp(-self.half_extent, self.half_extent)
+            places = torch.cat([level, places[..., 2:]], dim=-1)
+        if self.height is None:
+            return places
+        return torch.cat([places[..., :2], torch.full_like(places[..., 2:], self.height)], dim=-1)
+
+    def stays(self, path: Tensor, goals: Tensor, steps: Tensor) -> tuple[Tensor, Tensor]:
+        """How many steps before each candidate the target is at its place already, and how long it stays in all.
+
+        Args:
+            path: ``(*B, F + 1, 3)`` [m, world], the target now and in 1 … F steps.
+            goals: ``(*B, K, 3)`` [m, world].
+            steps: ``(K,)``, when the target is nearest to each.
+
+        Returns:
+            Both ``(*B, K)`` int64, in control steps; the stay is 0 where the target never comes within the footprint.
+        """
+        if self.footprint == 0.0:
+            one = torch.ones(goals.shape[:-1], dtype=torch.int64, device=goals.device)
+            return torch.zeros_like(one), one
+        around = torch.arange(-self.longest_stay, self.longest_stay + 1, device=steps.device)
+        index = (steps.unsqueeze(-1) + around).clamp(0, path.shape[-2] - 1)
+        near = path[..., index, :]
+        away = (near[..., :2] - goals[..., :2].unsqueeze(-2)).abs().amax(-1)
+        there = (away <= self.footprint) & (near[..., 2] > 0.0)
+        after = there[..., self.longest_stay :].long().cumprod(-1).sum(-1)
+        before = there[..., : self.longest_stay + 1].flip(-1).long().cumprod(-1).sum(-1)
+        stay = (before + after - 1).clamp(0, self.longest_stay)
+        return (before - 1).clamp_min(0), stay

@@ -1,0 +1,189 @@
+"""Meeting a target rather than running after it: wait above the meeting place, and drop in time."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from functools import partial
+from typing import Any
+
+import torch
+from tensordict import NestedKey, TensorDict, TensorDictBase
+from torch import Tensor
+
+from torchdyn_plan import keys
+from torchdyn_plan.checks import check_number
+from torchdyn_plan.planners.drop import Drop
+from torchdyn_plan.planners.dynamic import DynamicPlanner
+from torchdyn_plan.planners.exact import ExactSearch
+from torchdyn_plan.planners.memory import carry_on, recall, remember
+from torchdyn_plan.planners.protocol import ArrivalPredictor, StaticPlanner, read
+from torchdyn_plan.planners.rows import apply_to_rows
+from torchdyn_plan.planners.schedule import ReplanSchedule
+from torchdyn_plan.planners.search import SearchResult
+
+DROP_NAMES = ("outlook", "outlook_age", "drop_step", "tool_before")
+
+WAITING = ExactSearch(
+    height=0.105, half_extent=0.722, lead=7.0, margin=15.0, footprint=0.055, loyalty=8.0, arrived=0.015
+)  # fmt: skip
+"""Meets Trapper's ball: waits with the rim 2 cm above it, as far out as the rails let the box stand."""
+
+
+class MeetingPlanner(DynamicPlanner):
+    """Waits above the best place on the forecast, and drops when the box will enclose the target.
+
+    History → forecast → meeting (`ExactSearch`, with goals above the table) → ``goal``: above the meeting place until
+    `Drop` finds that now is the time, then down over the target, following it; and up to the next meeting if it was
+    missed. The static planner hears of all that through the goal alone. It re-plans often, every 4 steps by default.
+    Rows whose forecast holds a NaN or an infinity stay where they are and are not `reachable`.
+    """
+
+    def __init__(
+        self,
+        static: StaticPlanner,
+        forecaster: Callable[..., Tensor],
+        eta: ArrivalPredictor,
+        *,
+        search: ExactSearch | None = None,
+        schedule: ReplanSchedule | None = None,
+        drop: Drop | None = None,
+        table_height: float = 0.042,
+        pull: float = 0.03,
+        lead: int = 3,
+        chunk: int | None = None,
+    ) -> None:
+        """Join the parts.
+
+        Args:
+            static: planner for a static goal.
+            forecaster: as for `DynamicPlanner`.
+            eta: tells how long ``static`` needs to a goal.
+            search: chooses where to wait, and when for.
+            schedule: when to plan anew; every 4 steps from step 13 by default.
+            drop: sizes and the descent of ``static``.
+            table_height: height of a goal that brings the box down [m].
+            pull: the goal of a dropping box is at most so far from it, sideways [m].
+            lead: it follows the target this many steps ahead, as many as ``static`` lags behind.
+            chunk: plan in blocks of exactly this many rows, so that results do not depend on the batch size.
+        """
+        schedule = schedule or ReplanSchedule(window=4, shrink=1.0, minimum=4)
+        super().__init__(static, forecaster, eta, search=search or WAITING, schedule=schedule, chunk=chunk)
+        self.search: ExactSearch
+        check_number("lead", lead, minimum=0, integer=True)
+        for name, value in (("table_height", table_height), ("pull", pull)):
+            check_number(name, value, minimum=0.0)
+        self.drop, self.table_height, self.pull, self.lead = drop or Drop(), table_height, pull, lead
+        written: list[Any] = [(keys.PLAN, name) for name in DROP_NAMES]
+        self.out_keys = [*self.out_keys, *written]
+
+    def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
+        """Plan where a plan is due, wait or drop, and act; raises what `DynamicPlanner.forward` raises."""
+        get = partial(read, tensordict, reader="MeetingPlanner")
+        tool_pos, target_pos, robot_state = get(keys.TOOL_POS), get(keys.TARGET_POS), get(keys.ROBOT_STATE)
+        seen = [get(key) for key in self.seen_keys]
+        if not torch.compiler.is_compiling():
+            self._check(tool_pos, target_pos, dict(zip(self.seen_keys, seen, strict=True)))
+        step_count = get(keys.STEP_COUNT).reshape(tool_pos.shape[:-1])
+
+        memory = recall(tensordict)
+        clock, due = self.schedule.tick(None if memory is None else memory.clock, step_count)
+        meeting = carry_on(memory, tool_pos, step_count)
+        outlook, age, drop_step, tool_before = self._recall_drop(tensordict, tool_pos, target_pos, step_count)
+        outputs = (*meeting, outlook, age)
+        inputs = (robot_state, target_pos, tool_pos, meeting.arrival_steps, *seen)
+        *planned, outlook, age = apply_to_rows(self.plan_ahead, due, inputs, outputs, chunk=self.chunk)
+        meeting = SearchResult(*planned)
+
+        path = self._path(outlook, age)
+        started = clock.replans > 0
+        drop_step = self._drop_step(drop_step, path, tool_pos, tool_pos - tool_before, target_pos, started)
+        remember(tensordict, clock, meeting, replanned=due)
+        entries = dict(zip(DROP_NAMES, (outlook, age + 1, drop_step, tool_pos), strict=True))
+        plan = tensordict.get(keys.PLAN)
+        plan.update(TensorDict(entries, tensordict.batch_size, device=tensordict.device))
+        tensordict.set(keys.GOAL, self._goal(meeting, path, tool_pos, drop_step))
+        return self.static(tensordict)
+
+    def plan_ahead(
+        self, robot_state: Tensor, target_pos: Tensor, tool_pos: Tensor, planned_steps: Tensor, *seen: Tensor
+    ) -> tuple[Tensor, ...]:
+        """Forecast and choose a meeting; returns a `SearchResult`'s entries, the outlook and its age, 0.
+
+        Args:
+            robot_state: ``(R, S)``.
+            target_pos: ``(R, 3)`` [m, world].
+            tool_pos: ``(R, 3)`` [m, world].
+            planned_steps: ``(R,)`` control steps from now to the meeting planned before.
+            seen: what the forecaster reads.
+        """
+        forecast = self.forecaster(*seen)
+        usable = torch.isfinite(forecast).flatten(-2).all(-1)
+        known = torch.where(usable[..., None, None], forecast, target_pos.unsqueeze(-2))
+        eta = partial(self.eta.arrival, robot_state.unsqueeze(-2))
+        found = self.search(known, target_pos, eta, tool_pos=tool_pos, planned_steps=planned_steps)
+        goal = torch.where(usable.unsqueeze(-1), found.goal, tool_pos)
+        outlook = torch.cat([target_pos.unsqueeze(-2), known], dim=-2)[..., : self._outlook, :]
+        return (
+            goal, found.arrival_steps, found.clamped, found.reachable & usable,
+            outlook, torch.zeros_like(found.arrival_steps),
+        )  # fmt: skip
+
+    @property
+    def _outlook(self) -> int:
+        """Positions kept from a forecast: those that a drop looks at before the next plan is due, or a little later."""
+        return self.drop.outlook + 8
+
+    def _recall_drop(
+        self, tensordict: TensorDictBase, tool_pos: Tensor, target_pos: Tensor, step_count: Tensor
+    ) -> tuple[Tensor, ...]:
+        """Outlook (*B, T, 3) and its age, steps since a drop began (-1: none), and the tool a step ago (*B, 3)."""
+        nothing = target_pos.unsqueeze(-2).expand(*target_pos.shape[:-1], self._outlook, 3)
+        zero = torch.zeros_like(step_count)
+        start = (nothing, zero, zero - 1, tool_pos)
+        plan = tensordict.get(keys.PLAN, None)
+        if plan is None or plan.get(DROP_NAMES[0], None) is None:
+            return start
+        fresh = step_count == 0
+        old = map(plan.get, DROP_NAMES)
+        return tuple(
+            torch.where(fresh.reshape(*fresh.shape, *[1] * (new.dim() - fresh.dim())), new, value)
+            for new, value in zip(start, old, strict=True)
+        )
+
+    def _path(self, outlook: Tensor, age: Tensor) -> Tensor:
+        """The outlook from now on, ``(*B, drop.outlook, 3)``; its last position is repeated beyond its end."""
+        ahead = torch.arange(self.drop.outlook, device=age.device)
+        index = (age.unsqueeze(-1) + ahead).clamp(max=outlook.shape[-2] - 1)
+        return outlook.gather(-2, index.unsqueeze(-1).expand(*index.shape, 3))
+
+    def _drop_step(
+        self,
+        drop_step: Tensor,
+        path: Tensor,
+        tool_pos: Tensor,
+        tool_step: Tensor,
+        target_pos: Tensor,
+        started: Tensor,
+    ) -> Tensor:
+        """Steps since the drop began, -1 for none: begins when it is best to begin now, ends when it has missed."""
+        drop = self.drop
+        step = torch.where(drop_step >= 0, drop_step + 1, drop_step)
+        clearance = drop.clearance(path, tool_pos, tool_step)
+        now = (clearance.argmax(-1) == 0) & (clearance[..., 0] > 0.0)
+        above = (tool_pos[..., 2] > 0.95 * 2 * drop.radius) & (path[..., 2] > 0.0).all(-1)
+        step = torch.where((step < 0) & started & now & above, 0, step)
+        outside = (target_pos - tool_pos)[..., :2].abs().amax(-1) > drop.half_width + 0.01
+        missed = (outside & (step > 8)) | (step > 40)
+        return torch.where(missed, -1, step)
+
+    def _goal(self, meeting: SearchResult, path: Tensor, tool_pos: Tensor, drop_step: Tensor) -> Tensor:
+        """Above the meeting place, or down: first where the tool is, then after the target."""
+        level = tool_pos[..., :2]
+        way = path[..., self.lead, :2] - level
+        length = way.square().sum(-1, keepdim=True).sqrt().clamp_min(1e-9)
+        follow = (drop_step >= 3).unsqueeze(-1)
+        down = level + torch.where(follow, way * (length.clamp_max(self.pull) / length), 0.0)
+        if self.search.half_extent is not None:
+            down = down.clamp(-self.search.half_extent, self.search.half_extent)
+        down = torch.cat([down, torch.full_like(down[..., :1], self.table_height)], dim=-1)
+        return torch.where((drop_step >= 0).unsqueeze(-1), down, meeting.goal)
