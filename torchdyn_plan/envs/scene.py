@@ -32,7 +32,7 @@ class TrapperScene:
     """[m]"""
     rail_height: float = 0.05
     """[m]"""
-    pocket_gap: float = 0.225
+    pocket_gap: float = 0.23
     """Free width of a pocket between two rail segments [m]."""
     pocket_offset: float = 0.42
     """Distance of a pocket's middle from the middle of its wall [m]."""
@@ -42,11 +42,11 @@ class TrapperScene:
     """[kg]"""
     rolling_resistance: float = 0.0001
     """Lever arm of the cloth's resistance to rolling [m]; deceleration is 5/7·g·lever/radius."""
-    cloth_friction: float = 0.05
+    cloth_friction: float = 0.065
     """Sliding friction coefficient of ball on cloth."""
-    cushion_stiffness: float = 50000.0
+    cushion_stiffness: float = 70000.0
     """Stiffness of a cushion per effective mass [1/s²]."""
-    cushion_damping: float = 9.0
+    cushion_damping: float = 12.0
     """Damping of a cushion per effective mass [1/s]."""
     box_half_width: float = 0.065
     """Inner half-width of the box [m]."""
