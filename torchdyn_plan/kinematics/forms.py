@@ -110,7 +110,7 @@ class TransformForm(nn.Module):
         return [part.unflatten(-1, (3, -1)) for part in parts]
 
     def _pose(self, rows: Tensor) -> Tensor:
-        return torch.cat([rows, self._last_row.expand(len(rows), 1, 4)], dim=-2)
+        return torch.cat([rows, self._last_row.expand(rows.shape[0], 1, 4)], dim=-2)
 
 
 def sine_form(joints: Sequence[Joint], tool: Tensor) -> SineForm:
