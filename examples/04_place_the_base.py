@@ -1,4 +1,4 @@
-"""Where should an arm stand? Its base is moved until it reaches a set of goals, by gradients through inverse kinematics.
+"""Where should an arm stand? Gradients through inverse kinematics move its base until it reaches a set of goals.
 
 Each step solves for all goals at once and follows the derivative of the solutions with respect to the base, which
 the implicit function theorem gives: no step of the solver is differentiated.

@@ -10,6 +10,7 @@ from torch import Tensor, nn
 
 from torchdyn_plan.checks import check_choice, check_same_device, check_trailing_shape
 from torchdyn_plan.errors import InputError
+from torchdyn_plan.kinematics.components import ComponentForm
 from torchdyn_plan.kinematics.descriptions import joints_of_chain, joints_of_mjcf, joints_of_urdf
 from torchdyn_plan.kinematics.forms import FORMS
 from torchdyn_plan.kinematics.joint import Joint, merge_fixed
@@ -30,6 +31,8 @@ class Arm(nn.Module):
       UR5, about a thousand for a general seven-joint arm. Prismatic joints must come before the revolute ones.
     - ``"transforms"``: the product of a few transforms, each of some neighbouring joints and itself made of sines.
     - ``"auto"`` (default): sines, unless there would be more than `forms.MOST_SINES` of them or there cannot be any.
+
+    ``components`` is the same once more as code for a compiler, see `ComponentForm`.
     """
 
     lower: Tensor
@@ -68,6 +71,7 @@ class Arm(nn.Module):
         for name, values in limits.items():
             self.register_buffer(name, torch.tensor(values, dtype=torch.float64), persistent=False)
         self.form = FORMS[form](moving, tool)
+        self.components = ComponentForm(moving, tool)
         self.to(device=device, dtype=dtype)
 
     @classmethod

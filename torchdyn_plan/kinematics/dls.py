@@ -22,11 +22,10 @@ def dls_step(jacobian: Tensor, error: Tensor, damping: float | Tensor, *, prefer
     """
     if preferred is not None:
         error = error - (jacobian @ preferred.unsqueeze(-1)).squeeze(-1)
-    if isinstance(damping, Tensor):
-        damping = damping[..., None, None]
     gram = jacobian @ jacobian.mT
-    eye = torch.eye(gram.shape[-1], dtype=gram.dtype, device=gram.device)
-    factor, _ = torch.linalg.cholesky_ex(gram + damping * damping * eye)
+    square = damping.square().unsqueeze(-1) if isinstance(damping, Tensor) else damping**2
+    gram.diagonal(dim1=-2, dim2=-1).add_(square)
+    factor, _ = torch.linalg.cholesky_ex(gram)
     step = (jacobian.mT @ torch.cholesky_solve(error.unsqueeze(-1), factor)).squeeze(-1)
     return step if preferred is None else step + preferred
 
