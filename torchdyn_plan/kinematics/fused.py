@@ -12,15 +12,14 @@ from torchdyn_plan.errors import CompileError, InputError
 from torchdyn_plan.kinematics.components import Component, Vector
 
 Columns = tuple[Tensor, ...]
-LANES = 16
-"""Rows are padded to a multiple of this, so that none is computed otherwise than the rest."""
 
 
 class Fused:
     """``function`` of columns as one compiled loop; it has no derivatives.
 
     It is compiled for each precision and device at its first call there, for any number of rows; torch keeps what it
-    compiled in a cache on disk that other processes find.
+    compiled in a cache on disk that other processes find. A row's result does not depend on its batch: the last rows
+    of the loop are computed as the others are, by vector instructions under a mask.
     """
 
     def __init__(self, function: Callable[..., Sequence[Vector]]) -> None:
@@ -35,16 +34,13 @@ class Fused:
             CompileError: there is no compiler, or it failed.
             InputError: an argument requires a gradient.
         """
-        if torch.is_grad_enabled() and any(argument.requires_grad for argument in arguments):
+        if any(argument.requires_grad for argument in arguments) and torch.is_grad_enabled():
             raise InputError("a compiled solve has no derivatives: detach its arguments, or leave compiled=False")
-        rows = arguments[0].shape[0]
-        padding = -rows % LANES
-        columns = [_columns(argument, padding) for argument in arguments]
+        columns = [argument.T.contiguous() for argument in arguments]
         key = columns[0].device, columns[0].dtype
         if key not in self._compiled:
             self._compiled[key] = self._compile([argument.shape[1] for argument in arguments], *key)
-        results = self._compiled[key](*columns)
-        return [result.T[:rows] if padding else result.T for result in results]
+        return [result.T for result in self._compiled[key](*columns)]
 
     def __getstate__(self) -> dict[str, Any]:
         """Without what was compiled, which belongs to this process."""
@@ -60,7 +56,7 @@ class Fused:
             like = columns[0][0]
             return [torch.stack([filled(value, like) for value in vector]) for vector in results]
 
-        example: list[Any] = [torch.zeros(width, 4 * LANES, dtype=dtype, device=device) for width in widths]
+        example: list[Any] = [torch.zeros(width, 64, dtype=dtype, device=device) for width in widths]
         try:
             from torch._inductor import standalone_compile
 
@@ -79,13 +75,6 @@ class Fused:
                 f"that CXX names). Leave compiled=False to do without. {reason[0] if reason else error!r}"
             ) from error
         return compiled
-
-
-def _columns(rows: Tensor, padding: int) -> Tensor:
-    """Rows ``(B, W)`` as columns ``(W, B + padding)``."""
-    if padding:
-        return torch.nn.functional.pad(rows.T, (0, padding))
-    return rows.T.contiguous()
 
 
 def filled(value: Component, like: Tensor) -> Tensor:

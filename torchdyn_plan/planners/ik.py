@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import functools
+import math
 from collections.abc import Sequence
 from functools import partial
 from typing import Any
@@ -118,7 +119,7 @@ class IKPlanner(TensorDictModuleBase):
         check_trailing_shape(keys.JOINT_POS, joint_pos, self.arm.num_joints)
         check_trailing_shape(keys.GOAL, goal, *joint_pos.shape[:-1], 3)
         # The sum is a quick look: only a sum that is not finite is worth the full one.
-        if not torch.isfinite(goal.sum()):
+        if not math.isfinite(goal.sum().item()):
             check_finite(keys.GOAL, goal)
 
     def path(self, joint_pos: Tensor, goal: Tensor) -> Tensor:
@@ -137,8 +138,12 @@ class IKPlanner(TensorDictModuleBase):
         """
         joint_pos, goal = joint_pos.to(self._limit.dtype), goal.to(self._limit.dtype)
         if self._fused is not None:
+            if joint_pos.ndim == 2:
+                action, reached = self._fused(joint_pos, goal)
+                return action, reached
             rows = self._fused(joint_pos.reshape(-1, joint_pos.shape[-1]), goal.reshape(-1, 3))
-            return rows[0].reshape(joint_pos.shape), rows[1].reshape(joint_pos.shape)
+            action, reached = (value.reshape(joint_pos.shape) for value in rows)
+            return action, reached
         pose, jacobian = self._pose_and_jacobian(joint_pos)
         error = torch.stack(self._error(pose.flatten(-2).unbind(-1), goal.unbind(-1)), dim=-1)
         step = limited_step(dls_step(jacobian, error, self.damping), self._limit, self.gain)
