@@ -115,7 +115,7 @@ class Arm(nn.Module):
 
     def forward(self, joint_pos: Tensor) -> Tensor:
         """Pose of the tool, ``(*B, N)`` [rad; m] -> ``(*B, 4, 4)``, base frame [m]."""
-        self._check(joint_pos)
+        self.check(joint_pos)
         if joint_pos.ndim == 2:
             return self.form(joint_pos)
         return self.form(joint_pos.reshape(-1, self.num_joints)).view(*joint_pos.shape[:-1], 4, 4)
@@ -126,14 +126,15 @@ class Arm(nn.Module):
         Raises:
             InputError: ``joint_pos`` is not ``(*B, N)``, or of another device or precision than the arm.
         """
-        self._check(joint_pos)
+        self.check(joint_pos)
         if joint_pos.ndim == 2:
             return self.form.pose_and_jacobian(joint_pos)
         batch = joint_pos.shape[:-1]
         pose, jacobian = self.form.pose_and_jacobian(joint_pos.reshape(-1, self.num_joints))
         return pose.view(*batch, 4, 4), jacobian.view(*batch, 6, self.num_joints)
 
-    def _check(self, joint_pos: Tensor) -> None:
+    def check(self, joint_pos: Tensor) -> None:
+        """Raise `InputError` unless ``joint_pos`` is ``(*B, N)``, of the arm's device and precision."""
         lower = self.lower
         good = isinstance(joint_pos, Tensor) and joint_pos.dtype == lower.dtype and joint_pos.device == lower.device
         if good and joint_pos.shape[-1:] == lower.shape:
