@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator, Sequence
 from functools import cache
 from itertools import combinations, pairwise
+from typing import cast
 
 import torch
 from torch import Tensor, nn
@@ -46,11 +47,13 @@ class SineForm(nn.Module):
 
     def pose_and_jacobian(self, joint_pos: Tensor) -> tuple[Tensor, Tensor]:
         """Pose ``(B, 4, 4)`` and Jacobian ``(B, 6, N)``, for ``(B, N)``."""
-        sines = torch.addmm(self._phases, joint_pos, self._frequencies).sin_()
-        entries = torch.addmm(self._constant, sines, self._weights)
-        if self._slopes is not None:
-            entries = torch.addmm(entries, joint_pos, self._slopes)
-        pose, jacobian = entries.split((16, 6 * self.num_joints), dim=-1)
+        # A module's attribute that is a buffer takes as long to look up as a small operation; its table does not.
+        own = cast(dict[str, Tensor], self._buffers)
+        sines = torch.addmm(own["_phases"], joint_pos, own["_frequencies"]).sin()
+        entries = torch.addmm(own["_constant"], sines, own["_weights"])
+        if own["_slopes"] is not None:
+            entries = torch.addmm(entries, joint_pos, own["_slopes"])
+        pose, jacobian = entries.split_with_sizes((16, 6 * self.num_joints), dim=-1)
         return pose.view(-1, 4, 4), jacobian.view(-1, 6, self.num_joints)
 
 
