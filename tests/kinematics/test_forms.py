@@ -87,7 +87,7 @@ def test_random_chains_of_one_to_seven_joints_are_their_products_of_transforms(r
 
 @pytest.mark.parametrize(
     ("name", "kind", "sines"),
-    [("ur5", SineForm, 80), ("gantry", SineForm, 8), ("panda", TransformForm, 91), ("scara", TransformForm, 6)],
+    [("ur5", SineForm, 81), ("gantry", SineForm, 9), ("panda", TransformForm, 91), ("scara", TransformForm, 6)],
 )
 def test_the_form_is_chosen_by_the_size_of_the_expansion(name, kind, sines):
     arm = Arm.from_urdf(urdf(ARMS[name]), tip="tool")

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, cast
 
 import torch
 from torch import Tensor, nn
@@ -135,7 +135,7 @@ class Arm(nn.Module):
 
     def check(self, joint_pos: Tensor) -> None:
         """Raise `InputError` unless ``joint_pos`` is ``(*B, N)``, of the arm's device and precision."""
-        lower = self.lower
+        lower = cast(Tensor, self._buffers["lower"])
         good = isinstance(joint_pos, Tensor) and joint_pos.dtype == lower.dtype and joint_pos.device == lower.device
         if good and joint_pos.shape[-1:] == lower.shape:
             return

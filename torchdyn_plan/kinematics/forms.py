@@ -19,28 +19,27 @@ MOST_SINES = 128
 
 
 class SineForm(nn.Module):
-    """Pose and Jacobian as ``c + sin(q·C + b) · W``: three tensor operations."""
+    """Pose and Jacobian as ``sin(q·C + b) · W``, three tensor operations; the constant is a sine of frequency 0."""
 
     _frequencies: Tensor
     _phases: Tensor
     _weights: Tensor
-    _constant: Tensor
     _slopes: Tensor | None
 
     def __init__(self, form: TrigonometricForm) -> None:
         """Lay the entries of ``form`` out as a pose ``(4, 4)`` and a Jacobian ``(6, N)``, one after the other."""
         super().__init__()
         self.num_joints = len(form.frequencies)
-        _register(self, "_frequencies", form.frequencies)
-        _register(self, "_phases", form.phases)
-        _register(self, "_weights", _laid_out(form.weights, 0.0))
-        _register(self, "_constant", _laid_out(form.constant.unsqueeze(0), 1.0)[0])
+        constant = _laid_out(form.constant.unsqueeze(0), 1.0)
+        _register(self, "_frequencies", torch.nn.functional.pad(form.frequencies, (1, 0)))
+        _register(self, "_phases", torch.nn.functional.pad(form.phases, (1, 0), value=torch.pi / 2))
+        _register(self, "_weights", torch.cat([constant, _laid_out(form.weights, 0.0)]))
         _register(self, "_slopes", None if form.slopes is None else _laid_out(form.slopes, 0.0))
 
     def forward(self, joint_pos: Tensor) -> Tensor:
         """Pose ``(B, 4, 4)`` alone, for ``(B, N)``."""
         sines = torch.addmm(self._phases, joint_pos, self._frequencies).sin()
-        pose = torch.addmm(self._constant[:16], sines, self._weights[:, :16])
+        pose = torch.mm(sines, self._weights[:, :16])
         if self._slopes is not None:
             pose = torch.addmm(pose, joint_pos, self._slopes[:, :16])
         return pose.view(-1, 4, 4)
@@ -50,7 +49,7 @@ class SineForm(nn.Module):
         # A module's attribute that is a buffer takes as long to look up as a small operation; its table does not.
         own = cast(dict[str, Tensor], self._buffers)
         sines = torch.addmm(own["_phases"], joint_pos, own["_frequencies"]).sin()
-        entries = torch.addmm(own["_constant"], sines, own["_weights"])
+        entries = torch.mm(sines, own["_weights"])
         if own["_slopes"] is not None:
             entries = torch.addmm(entries, joint_pos, own["_slopes"])
         pose, jacobian = entries.split_with_sizes((16, 6 * self.num_joints), dim=-1)

@@ -21,7 +21,8 @@ class DampedSteps(nn.Module):
     """
 
     _ridge: Tensor
-    _turn: Tensor
+    _error: Tensor
+    _error_of_target: Tensor
 
     def __init__(self, arm: Arm, *, steps: int = 5, damping: float = 0.02, compiled: bool = False) -> None:
         """Step ``arm``; ``damping`` is λ. ``compiled`` is one loop by a C++ compiler, see `Fused`."""
@@ -31,7 +32,9 @@ class DampedSteps(nn.Module):
         self.arm, self.steps, self.damping = arm, steps, damping
         like = {"dtype": arm.lower.dtype, "device": arm.lower.device}
         self.register_buffer("_ridge", damping**2 * torch.eye(6, **like), persistent=False)
-        self.register_buffer("_turn", _half_permutations().to(**like), persistent=False)
+        constant, linear = _error_matrices()
+        self.register_buffer("_error", constant.to(**like), persistent=False)
+        self.register_buffer("_error_of_target", linear.to(**like), persistent=False)
         self._fused = Fused(self._columns) if compiled else None
 
     def forward(self, joint_pos: Tensor, target: Tensor) -> Tensor:
@@ -47,7 +50,8 @@ class DampedSteps(nn.Module):
         return q.reshape(joint_pos.shape)
 
     def _eager(self, q: Tensor, target: Tensor) -> Tensor:
-        to_error = self._error_of_pose(target)
+        # The error is linear in the pose, by a matrix that is linear in the target.
+        to_error = torch.addmm(self._error, target, self._error_of_target).view(-1, 6, 16)
         for _ in range(self.steps):
             pose, jacobian = self.arm.form.pose_and_jacobian(q)
             error = torch.bmm(to_error, pose.reshape(-1, 16, 1))
@@ -55,15 +59,6 @@ class DampedSteps(nn.Module):
             weights = torch.cholesky_solve(error, torch.linalg.cholesky_ex(gram)[0])
             q = torch.baddbmm(q.unsqueeze(-1), jacobian.mT, weights).squeeze(-1)
         return q
-
-    def _error_of_pose(self, target: Tensor) -> Tensor:
-        """The error is linear in the pose: ``(B, 6, 16)``, by which a flat pose (its last entry is 1) becomes it."""
-        matrix = target.new_zeros(len(target), 6, 4, 4)
-        matrix[:, (0, 1, 2), (0, 1, 2), 3] = -1.0
-        matrix[:, :3, 3, 3] = target.view(-1, 4, 4)[:, :3, 3]
-        turned = torch.mm(self._turn, target.view(-1, 4, 4)[:, :3, :3].permute(1, 0, 2).reshape(3, -1))
-        matrix[:, 3:, :3, :3] = turned.view(3, 3, -1, 3).permute(2, 0, 1, 3)
-        return matrix.flatten(-2)
 
     def _columns(self, joint_pos: Columns, target: Columns) -> tuple[Vector]:
         """`_eager`, column by column."""
@@ -98,9 +93,19 @@ def compiled_pose_and_jacobian(arm: Arm) -> Callable[[Tensor], tuple[Tensor, Ten
     return pose_and_jacobian
 
 
-def _half_permutations() -> Tensor:
-    """½ εₐᵦ꜀ as ``(9, 3)``: rows (a, b)."""
-    symbol = torch.zeros(3, 3, 3)
+def _error_matrices() -> tuple[Tensor, Tensor]:
+    """What turns flat targets t into flat matrices E, by which a flat pose p, last entry 1, becomes the error E p.
+
+    Returns:
+        Constant ``(96,)`` and linear part ``(16, 96)`` of E, ``(6, 16)`` laid out flat.
+    """
+    constant, linear = torch.zeros(6, 4, 4), torch.zeros(4, 4, 6, 4, 4)
+    for i in range(3):
+        constant[i, i, 3] = -1.0
+        linear[i, 3, i, 3, 3] = 1.0
     for a, b, c in ((0, 1, 2), (1, 2, 0), (2, 0, 1)):
-        symbol[a, b, c], symbol[a, c, b] = 0.5, -0.5
-    return symbol.view(9, 3)
+        for j in range(3):
+            # ½ (r × t) of column j, entry a: r_b t_c - r_c t_b.
+            linear[c, j, 3 + a, b, j] = 0.5
+            linear[b, j, 3 + a, c, j] = -0.5
+    return constant.flatten(), linear.view(16, 96)
