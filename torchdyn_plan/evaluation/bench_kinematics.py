@@ -121,11 +121,11 @@ def _rival_rows(others: Sequence[Any], batch: int) -> Measured:
 def _solutions(*, rivals: bool) -> Measured:
     """Reachable poses from random starts."""
     random = torch.Generator().manual_seed(2)
-    arm = Arm.ur5()
-    target, q0 = (math.pi * (2.0 * torch.rand(2, SOLVED_AT_ONCE, 6, generator=random) - 1.0)).unbind()
-    target = arm(target)
+    uniform = 2.0 * torch.rand(2, SOLVED_AT_ONCE, 6, generator=random, dtype=torch.float64) - 1.0
+    arm, target = Arm.ur5(), Arm.ur5(dtype=torch.float64)(math.pi * uniform[0])
+    single, q0 = target.float(), math.pi * uniform[1].float()
     about = {"what": SOLUTION, "implementation": "torchdyn_plan", "compiled": False}
-    yield about, lambda: solve_ik(arm, target, q0=q0).q, partial(_solved, target)
+    yield about, lambda: solve_ik(arm, single, q0=q0).q, partial(_solved, target)
     for other in installed((Eaik,)) if rivals else ():
         yield {**about, "implementation": other.name}, other.solve(target), partial(_solved, target)
 

@@ -86,8 +86,8 @@ def plot_bench(rows: Sequence[Mapping[str, Any]], path: Path) -> None:
     Raises:
         OutputError: the file cannot be written.
     """
-    kinds = list(dict.fromkeys(_implementation(row) for row in rows))
     tasks = [task for task in dict.fromkeys(row["what"] for row in rows) if _batches(rows, task) > 1]
+    kinds = list(dict.fromkeys(_implementation(row) for row in rows if row["what"] in tasks))
     figure, panels = _panels(height=4.6, count=len(tasks))
     for axes, task in zip(panels, tasks, strict=True):
         for index, kind in enumerate(kinds):

@@ -100,26 +100,23 @@ def damped_least_squares(columns: Matrix, error: Sequence[Component], damping: C
     """Joint step Jᵀ(JJᵀ + λ²I)⁻¹e of `dls_step` by an unrolled LDLᵀ, whose pivots are at least about λ²."""
     size, square = len(error), multiply(damping, damping)
     rows = list(zip(*columns, strict=True))
+    # L·D and L, column by column; a division takes as long as ten products, so each pivot is inverted once.
+    scaled: Matrix = [[0.0] * size for _ in range(size)]
     lower: Matrix = [[0.0] * size for _ in range(size)]
-    pivots: Vector = []
+    inverses: Vector = []
     for j in range(size):
-        pivot = add(dot(rows[j], rows[j]), square)
-        for k in range(j):
-            pivot = subtract(pivot, multiply(multiply(lower[j][k], lower[j][k]), pivots[k]))
-        pivots.append(pivot)
+        pivot = subtract(add(dot(rows[j], rows[j]), square), dot(scaled[j][:j], lower[j][:j]))
+        inverses.append(1.0 / pivot)
         for i in range(j + 1, size):
-            entry = dot(rows[i], rows[j])
-            for k in range(j):
-                entry = subtract(entry, multiply(multiply(lower[i][k], lower[j][k]), pivots[k]))
-            lower[i][j] = entry if isinstance(entry, float) and entry == 0.0 else entry / pivot
+            scaled[i][j] = subtract(dot(rows[i], rows[j]), dot(scaled[i][:j], lower[j][:j]))
+            lower[i][j] = multiply(scaled[i][j], inverses[j])
     weights = list(error)
     for i in range(size):
-        for k in range(i):
-            weights[i] = subtract(weights[i], multiply(lower[i][k], weights[k]))
-    weights = [weight / pivot for weight, pivot in zip(weights, pivots, strict=True)]
+        weights[i] = subtract(weights[i], dot(lower[i][:i], weights[:i]))
+    weights = [multiply(weight, inverse) for weight, inverse in zip(weights, inverses, strict=True)]
     for i in reversed(range(size)):
-        for k in range(i + 1, size):
-            weights[i] = subtract(weights[i], multiply(lower[k][i], weights[k]))
+        below = [lower[k][i] for k in range(i + 1, size)]
+        weights[i] = subtract(weights[i], dot(below, weights[i + 1 :]))
     return [dot(column, weights) for column in columns]
 
 

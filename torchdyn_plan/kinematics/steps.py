@@ -46,7 +46,7 @@ class DampedSteps(nn.Module):
         self.arm.check(joint_pos)
         check_trailing_shape("target", target, *joint_pos.shape[:-1], 4, 4)
         q, wanted = joint_pos.reshape(-1, self.arm.num_joints), target.reshape(-1, 16)
-        q = self._fused(q, wanted)[0] if self._fused is not None else self._eager(q, wanted)
+        q = self._fused(q, wanted[:, :12])[0] if self._fused is not None else self._eager(q, wanted)
         return q.reshape(joint_pos.shape)
 
     def _eager(self, q: Tensor, target: Tensor) -> Tensor:
