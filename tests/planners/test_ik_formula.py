@@ -2,15 +2,11 @@
 
 import copy
 import math
-import os
-import subprocess
-import sys
 
 import pytest
 import torch
 
 from tests.planners.follower import APPROACH, after, goals, home, observe
-from torchdyn_plan.errors import InputError
 from torchdyn_plan.kinematics import Arm, dls_step, limited_step, upright_error
 from torchdyn_plan.planners import IKPlanner
 
@@ -108,20 +104,6 @@ def test_compiled_rows_do_not_depend_on_their_batch(compiled):
 
 
 @pytest.mark.slow
-def test_a_compiled_planner_is_copied_and_refuses_gradients(compiled):
+def test_a_compiled_planner_is_copied(compiled):
     joint_pos, goal = situations(4)
     assert torch.equal(copy.deepcopy(compiled).step(joint_pos, goal)[0], compiled.step(joint_pos, goal)[0])
-    with pytest.raises(InputError, match="a compiled solve has no derivatives"):
-        compiled.step(joint_pos.requires_grad_(), goal)
-
-
-@pytest.mark.slow
-def test_without_a_compiler_the_error_says_so(tmp_path):
-    code = (
-        "import torch; from torchdyn_plan.planners import IKPlanner; from torchdyn_plan.errors import CompileError\n"
-        "try: IKPlanner(compiled=True).step(torch.zeros(1, 6), torch.zeros(1, 3))\n"
-        "except CompileError as error: print(error)"
-    )
-    environment = {**os.environ, "CXX": "no-such-compiler", "TORCHINDUCTOR_CACHE_DIR": str(tmp_path)}
-    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False, env=environment)
-    assert "cannot be compiled; it needs a working C++ compiler" in done.stdout, done.stderr
