@@ -26,7 +26,7 @@ check: $(STAMP)
 	OMP_NUM_THREADS=1 $(BIN)/pytest -q -n 2
 
 lock: uv
-	$(UV) pip compile pyproject.toml --all-extras --group dev --generate-hashes --no-emit-index-url --no-header --universal -q -o requirements.lock
+	$(UV) pip compile pyproject.toml --extra cli --group dev --generate-hashes --no-emit-index-url --no-header --universal -q -o requirements.lock
 
 $(STAMP): pyproject.toml requirements.lock
 	@$(MAKE) --no-print-directory uv

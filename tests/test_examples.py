@@ -8,7 +8,12 @@ EXAMPLES = Path(__file__).parent.parent / "examples"
 
 
 @pytest.mark.parametrize(
-    ("name", "says"), [("01_trap_a_ball.py", "DynamicPlanner  traps"), ("02_own_static_planner.py", "target 0.0")]
+    ("name", "says"),
+    [
+        ("01_trap_a_ball.py", "DynamicPlanner  traps"),
+        ("02_own_static_planner.py", "target 0.0"),
+        ("04_place_the_base.py", "40 of 40 goals reached"),
+    ],
 )
 def test_example_runs(name, says):
     run = subprocess.run([sys.executable, EXAMPLES / name], capture_output=True, text=True, check=False, timeout=300)

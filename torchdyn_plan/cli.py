@@ -67,11 +67,14 @@ def bench(arguments: BenchArguments) -> None:
         check_writable_folder(arguments.out.parent)
         if arguments.out.is_dir():
             raise OutputError(f"output file {str(arguments.out)!r} is a folder")
-    rows = importlib.import_module(BENCHMARKS[arguments.name]).bench()
+    benchmark = importlib.import_module(BENCHMARKS[arguments.name])
+    rows = benchmark.bench()
     for row in rows:
         print("  ".join(f"{name} {value}" for name, value in row.items()))
     if arguments.out is not None:
         write_json(arguments.out, {"machine": machine(), "versions": library_versions(), "rows": rows})
+        if hasattr(benchmark, "plot"):
+            benchmark.plot(rows, arguments.out.with_suffix(".png"))
 
 
 COMMANDS: dict[type, Callable[[Any], None]] = {

@@ -17,8 +17,12 @@ STATICS = ("ik",)
 SPLITS = ("test", "dev")
 """Series of episodes to evaluate on: tuning sees ``dev`` only."""
 
-BENCHMARKS = {"replan": "torchdyn_plan.evaluation.bench_replan", "env": "torchdyn_plan.evaluation.bench_env"}
-"""Name of each benchmark, and the module whose ``bench()`` returns its rows."""
+BENCHMARKS = {
+    "replan": "torchdyn_plan.evaluation.bench_replan",
+    "env": "torchdyn_plan.evaluation.bench_env",
+    "kinematics": "torchdyn_plan.evaluation.bench_kinematics",
+}
+"""Name of each benchmark, and the module whose ``bench()`` returns its rows and whose ``plot``, if any, draws them."""
 
 
 @contextmanager
@@ -221,9 +225,9 @@ class BenchArguments:
     """Measure speed on this machine."""
 
     name: str
-    """What to measure: replan (latency of a re-plan) or env (rate of the simulation)."""
+    """What to measure: replan (latency of a re-plan), env (rate of the simulation) or kinematics (beside others')."""
     out: Path | None = None
-    """JSON file for the figures."""
+    """JSON file for the figures; a plot, where there is one, is put beside it."""
 
     def __post_init__(self) -> None:
         from torchdyn_plan.checks import check_choice

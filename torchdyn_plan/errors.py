@@ -21,5 +21,9 @@ class TrainingError(TorchdynPlanError, RuntimeError):
     """A training run cannot go on; its last good checkpoint is kept."""
 
 
+class CompileError(TorchdynPlanError, RuntimeError):
+    """Something cannot be compiled on this machine."""
+
+
 class UsageError(TorchdynPlanError):
     """An argument of a command is wrong."""

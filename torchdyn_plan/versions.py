@@ -5,7 +5,18 @@ import platform
 from importlib import metadata
 from pathlib import Path
 
-LIBRARIES = ("torchdyn-plan", "torch", "tensordict", "torchrl", "mujoco", "pytorch-kinematics", "numpy")
+LIBRARIES = (
+    "torchdyn-plan",
+    "torch",
+    "tensordict",
+    "torchrl",
+    "mujoco",
+    "pytorch-kinematics",
+    "numpy",
+    "pin",
+    "mink",
+    "eaik",
+)
 
 
 def library_versions() -> dict[str, str | None]:

@@ -10,7 +10,7 @@ from torchdyn_plan.envs.trapper import HOLD_STEPS
 from torchdyn_plan.errors import InputError
 from torchdyn_plan.kinematics import Arm
 from torchdyn_plan.planners import IKPlanner
-from torchdyn_plan.planners.ik import Approach
+from torchdyn_plan.planners.approach import Approach
 
 SCENE = TrapperScene()
 SIZES = {"N": 6, "A": 6, "H": 24, "S": 15}

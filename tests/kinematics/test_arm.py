@@ -137,18 +137,55 @@ def urdf(kind, limit='<limit lower="-1" upper="1" effort="1" velocity="1"/>'):
     )
 
 
-@pytest.mark.parametrize(
-    ("kind", "message"),
-    [("prismatic", "joint 'slide' is prismatic"), ("fixed", "no joint that moves")],
-)
-def test_a_chain_that_is_not_revolute_is_refused(kind, message):
-    with pytest.raises(InputError, match=message):
+def test_a_chain_without_a_joint_that_moves_is_refused():
+    with pytest.raises(InputError, match="no joint that moves"):
+        Arm.from_urdf(urdf("fixed"), tip="b")
+
+
+@pytest.mark.parametrize("kind", ["floating", "planar"])
+def test_a_joint_of_another_kind_is_refused(kind):
+    with pytest.raises(InputError, match=f"has a joint of type '{kind}'; Arm handles fixed, revolute and prismatic"):
         Arm.from_urdf(urdf(kind), tip="b")
+
+
+def test_a_joint_that_mimics_another_is_refused():
+    with pytest.raises(InputError, match="joint 'slide' mimics another"):
+        Arm.from_urdf(
+            urdf("revolute", '<limit lower="-1" upper="1" effort="1" velocity="1"/><mimic joint="o"/>'), tip="b"
+        )
+
+
+def test_a_ball_joint_of_mjcf_is_refused():
+    text = '<mujoco><worldbody><body name="b"><joint type="ball"/><geom size="1"/></body></worldbody></mujoco>'
+    with pytest.raises(InputError, match=r"the MJCF text has a joint of type .*; Arm handles fixed, revolute"):
+        Arm.from_mjcf(text, tip="b")
+
+
+@pytest.mark.parametrize(
+    ("read", "text"), [(Arm.from_urdf, "<robot"), (Arm.from_mjcf, "<mujoco>"), (Arm.from_urdf, "")]
+)
+def test_text_that_is_no_description_is_refused(read, text):
+    with pytest.raises(InputError, match="text cannot be read"):
+        read(text, tip="b")
+
+
+def test_another_precision_and_another_device_are_named(arm):
+    with pytest.raises(InputError, match=r"joint_pos is torch.float32, but the arm is torch.float64"):
+        arm(torch.zeros(6))
+    with pytest.raises(InputError, match="joint_pos is on meta, but the arm is on cpu"):
+        arm(torch.zeros(6, device="meta", dtype=torch.float64))
 
 
 def test_an_unknown_tip_is_refused_with_the_choices():
     with pytest.raises(InputError, match=r"unknown link 'too' \(did you mean 'tool'"):
         Arm.from_urdf(ur5_urdf(), tip="too")
+
+
+def test_an_unknown_base_and_one_beyond_the_tip_are_refused():
+    with pytest.raises(InputError, match=r"unknown link 'bas' \(did you mean 'base'"):
+        Arm.from_urdf(ur5_urdf(), tip="tool", base="bas")
+    with pytest.raises(InputError, match="link 'forearm' does not hang from link 'tool'"):
+        Arm.from_urdf(ur5_urdf(), tip="forearm", base="tool")
 
 
 def test_any_axis_and_offset_equals_pytorch_kinematics():

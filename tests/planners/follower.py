@@ -8,7 +8,7 @@ from tensordict import TensorDict
 from torchdyn_plan.envs import TrapperScene
 from torchdyn_plan.kinematics import Arm
 from torchdyn_plan.planners import IKPlanner
-from torchdyn_plan.planners.ik import Approach
+from torchdyn_plan.planners.approach import Approach
 
 SCENE, APPROACH = TrapperScene(), Approach()
 BASE = torch.tensor(APPROACH.base_pos)

@@ -7,7 +7,7 @@ from tests.planners.follower import APPROACH, BASE, DOUBLE, MIDDLE, SCENE, after
 from torchdyn_plan.envs.reaching import ReachingTask
 from torchdyn_plan.kinematics import upright_error
 from torchdyn_plan.planners import IKPlanner
-from torchdyn_plan.planners.ik import Approach, way_to
+from torchdyn_plan.planners.approach import Approach, tool_target, way_to
 
 
 @pytest.mark.parametrize("height", [0.0, 0.3, -0.4])
@@ -67,8 +67,14 @@ def test_a_goal_where_the_tool_is_moves_nothing():
     assert action.abs().max() < 1e-2
 
 
+def placed(goal, approach=APPROACH):
+    """Place of the box mouth in the world, and whether the goal is on the table."""
+    x, y, height, on_table = tool_target(goal.unbind(-1), approach)
+    return torch.stack([x + approach.base_pos[0], y + approach.base_pos[1], height], dim=-1), on_table
+
+
 def target(goal, **approach):
-    return IKPlanner(approach=Approach(**approach)).tool_target(torch.tensor(goal))[0]
+    return placed(torch.tensor(goal), Approach(**approach))[0]
 
 
 def test_goals_by_the_cushion_are_clamped_to_where_the_box_clears_it():
@@ -89,19 +95,20 @@ def test_goals_out_of_reach_are_clamped_along_their_direction_from_the_base():
 
 def test_goals_within_reach_are_kept_and_only_those_on_the_table_put_down():
     goal = torch.cat([goals(20), goals(20, height=APPROACH.table_height), goals(20, height=0.2)])
-    place, on_table = IKPlanner().tool_target(goal)
+    place, on_table = placed(goal)
     assert on_table.tolist() == [True] * 40 + [False] * 20
     torch.testing.assert_close(place[:, :2], goal[:, :2])
     torch.testing.assert_close(place[:40, 2], torch.full((40,), APPROACH.down_height))
     torch.testing.assert_close(place[40:, 2], goal[40:, 2])
 
 
-def test_the_way_sideways_turns_and_reaches_about_the_arms_axis():
-    start, end = torch.tensor([0.6, 0.0, 0.2]), torch.tensor([0.0, 0.6, 0.2])
-    way = way_to(start, end, torch.tensor(False), APPROACH, 0.0)
-    torch.testing.assert_close(way, torch.tensor([0.0, 0.6 * math.pi / 2, 0.0]), atol=1e-6, rtol=0)
-    way = way_to(start, torch.tensor([0.8, 0.0, 0.1]), torch.tensor(False), APPROACH, 0.0)
-    torch.testing.assert_close(way, torch.tensor([0.2, 0.0, -0.1]), atol=1e-6, rtol=0)
+@pytest.mark.parametrize(
+    ("end", "expected"), [((0.0, 0.6, 0.2), (0.0, 0.6 * math.pi / 2, 0.0)), ((0.8, 0.0, 0.1), (0.2, 0.0, -0.1))]
+)
+def test_the_way_sideways_turns_and_reaches_about_the_arms_axis(end, expected):
+    start, end = torch.tensor([0.6, 0.0, 0.2]), torch.tensor(end)
+    way = torch.stack(way_to(start.unbind(), end.unbind(), torch.tensor(False), APPROACH))
+    torch.testing.assert_close(way, torch.tensor(expected), atol=1e-6, rtol=0)
 
 
 def test_random_goals_on_the_table_are_all_reached_in_simulation():

@@ -1,8 +1,8 @@
 """Figures of results, beside the paper's. matplotlib is imported where a figure is drawn."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from torchdyn_plan.evaluation.intervals import Rate
 from torchdyn_plan.evaluation.paper import Sweep, paper_curve
@@ -19,6 +19,7 @@ COLOURS = {"pursuit": "#D55E00", "corner": "#0072B2", "oracle": "#009E73", "exac
 MARKERS = {"pursuit": "s", "corner": "o", "oracle": "^", "exact": "D", "meet": "v"}
 
 _GREY = "#555555"
+_PALETTE = ("#0072B2", "#56B4E9", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#000000")
 _PANELS = (("all episodes", False), ("solvable episodes", True))
 _AXES = {"velocity": "velocity of the ball [m/s]", "friction": "friction loss of the ball [N]"}
 
@@ -75,6 +76,43 @@ def plot_sweep(rows: Sequence[ResultRow], over: Sweep, path: Path) -> None:
     _save(figure, path)
 
 
+def plot_bench(rows: Sequence[Mapping[str, Any]], path: Path) -> None:
+    """Median time for one item over the batch, a panel for each task and a line for each implementation.
+
+    Args:
+        rows: those of a benchmark.
+        path: file to write; its ending chooses the format.
+
+    Raises:
+        OutputError: the file cannot be written.
+    """
+    tasks = [task for task in dict.fromkeys(row["what"] for row in rows) if _batches(rows, task) > 1]
+    kinds = list(dict.fromkeys(_implementation(row) for row in rows if row["what"] in tasks))
+    figure, panels = _panels(height=4.6, count=len(tasks))
+    for axes, task in zip(panels, tasks, strict=True):
+        for index, kind in enumerate(kinds):
+            mine = [row for row in rows if row["what"] == task and _implementation(row) == kind]
+            x, y = [row["batch"] for row in mine], [row["median_us"] / row["batch"] for row in mine]
+            style = "--" if "compiled" in kind else "-"
+            axes.loglog(x, y, style, color=_PALETTE[index % len(_PALETTE)], marker="o", markersize=4, label=kind)
+        axes.set(title=task, xlabel="batch")
+        axes.grid(alpha=0.3)
+    panels[0].set_ylabel("median time for one [µs]")
+    labels = {label: line for axes in panels for line, label in zip(*axes.get_legend_handles_labels(), strict=True)}
+    figure.legend(labels.values(), labels.keys(), loc="outside lower center", ncols=4, frameon=False)
+    _save(figure, path)
+
+
+def _implementation(row: Mapping[str, Any]) -> str:
+    """Name of a line."""
+    device = "" if row["device"] == "cpu" else f", {row['device']}"
+    return f"{row['implementation']}{', compiled' if row['compiled'] else ''}{device}"
+
+
+def _batches(rows: Sequence[Mapping[str, Any]], task: str) -> int:
+    return len({row["batch"] for row in rows if row["what"] == task})
+
+
 def _success(row: ResultRow, solvable: bool) -> Rate | None:
     value = row.success_solvable if solvable else row.success
     return None if value is None else Rate(value, *(row.success_solvable_ci if solvable else row.success_ci))
@@ -112,16 +150,17 @@ def _draw_curve(axes: "Axes", rows: Sequence[ResultRow], over: Sweep, solvable: 
         axes.plot(*paper, "--", color=colour, linewidth=1.0, alpha=0.8)
 
 
-def _panels(height: float) -> tuple["Figure", list["Axes"]]:
-    """Two panels side by side that share the success axis, drawn without a display."""
+def _panels(height: float, count: int = 2) -> tuple["Figure", list["Axes"]]:
+    """Panels side by side that share the upright axis, drawn without a display."""
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
 
-    figure = Figure(figsize=(9.0, height), layout="constrained", dpi=150)
+    figure = Figure(figsize=(max(9.0, 3.5 * count), height), layout="constrained", dpi=150)
     FigureCanvasAgg(figure)
-    panels = [figure.add_subplot(1, 2, 1)]
-    panels.append(figure.add_subplot(1, 2, 2, sharey=panels[0]))
-    panels[1].tick_params(labelleft=False)
+    panels = [figure.add_subplot(1, count, 1)]
+    for index in range(2, count + 1):
+        panels.append(figure.add_subplot(1, count, index, sharey=panels[0]))
+        panels[-1].tick_params(labelleft=False)
     for axes in panels:
         axes.spines[["top", "right"]].set_visible(False)
     return figure, panels

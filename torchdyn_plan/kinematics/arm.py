@@ -1,15 +1,19 @@
-"""A serial arm as batched torch: its pose and Jacobian in three tensor operations."""
+"""A serial arm as batched torch: its pose and Jacobian in a handful of tensor operations."""
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any
+from collections.abc import Sequence
+from typing import TYPE_CHECKING, Any, cast
 
 import torch
 from torch import Tensor, nn
 
-from torchdyn_plan.checks import check_choice, check_trailing_shape
+from torchdyn_plan.checks import check_choice, check_same_device, check_trailing_shape
 from torchdyn_plan.errors import InputError
-from torchdyn_plan.kinematics.trigonometric import Joint, trigonometric_form
+from torchdyn_plan.kinematics.components import ComponentForm
+from torchdyn_plan.kinematics.descriptions import joints_of_chain, joints_of_mjcf, joints_of_urdf
+from torchdyn_plan.kinematics.forms import FORMS
+from torchdyn_plan.kinematics.joint import Joint, merge_fixed
 from torchdyn_plan.kinematics.ur5 import UR5_SPEED_LIMIT, ur5_urdf
 
 if TYPE_CHECKING:
@@ -17,46 +21,58 @@ if TYPE_CHECKING:
 
 
 class Arm(nn.Module):
-    """A serial chain of N revolute joints, parsed by pytorch-kinematics and evaluated in closed form.
+    """A serial chain of N revolute and prismatic joints, parsed by pytorch-kinematics and evaluated in closed form.
 
-    The buffers ``lower``, ``upper`` (N,) [rad] and ``speed_limit`` (N,) [rad/s] hold the joints' limits.
-    The number of sines grows with the number of non-parallel joints: 81 for a UR5, about a thousand for a
-    general seven-joint arm.
+    The buffers ``lower``, ``upper`` (N,) [rad; m] and ``speed_limit`` (N,) [rad/s; m/s] hold the joints' limits.
+
+    ``form`` says how the arm is evaluated; all forms are exact, and the attribute of that name does the work:
+
+    - ``"sines"``: pose and Jacobian as one product of sines, the fastest as long as there are few of them: 81 for a
+      UR5, about a thousand for a general seven-joint arm. Prismatic joints must come before the revolute ones.
+    - ``"transforms"``: the product of a few transforms, each of some neighbouring joints and itself made of sines.
+    - ``"auto"`` (default): sines, unless there would be more than `forms.MOST_SINES` of them or there cannot be any.
+
+    ``components`` is the same once more as code for a compiler, see `ComponentForm`.
     """
 
     lower: Tensor
     upper: Tensor
     speed_limit: Tensor
-    _frequencies: Tensor
-    _phases: Tensor
-    _weights: Tensor
 
     def __init__(
         self,
-        chain: pytorch_kinematics.SerialChain,
+        joints: Sequence[Joint],
         *,
         speed_limit: float | None = None,
+        form: str = "auto",
         dtype: torch.dtype = torch.float32,
         device: torch.device | str | None = None,
     ) -> None:
-        """Take over ``chain``; ``speed_limit`` [rad/s] replaces the description's own.
+        """Build from ``joints``, base to tip; ``speed_limit`` [rad/s; m/s] replaces their own.
+
+        Where offsets of joints require gradients, pose and Jacobian have gradients in them.
 
         Raises:
-            InputError: the chain has a joint that is neither fixed nor revolute, or none that moves.
+            InputError: no joint moves, the form is unknown, or a prismatic joint cannot be had in sines.
         """
         super().__init__()
-        joints = _joints(chain)
-        self.joint_names: tuple[str, ...] = tuple(chain.get_joint_parameter_names())
-        self.num_joints = len(self.joint_names)
-        form = trigonometric_form(joints)
-        lower, upper = chain.get_joint_limits()
-        speeds = [speed_limit] * self.num_joints if speed_limit else chain.get_joint_velocity_limits()[1]
-        constants = {
-            "lower": lower, "upper": upper, "speed_limit": speeds,
-            "_frequencies": form.frequencies, "_phases": form.phases, "_weights": form.weights,
-        }  # fmt: skip
-        for name, value in constants.items():
-            self.register_buffer(name, torch.as_tensor(value, dtype=dtype, device=device), persistent=False)
+        check_choice("form", form, FORMS)
+        moving, tool = merge_fixed(joints)
+        if not moving:
+            raise InputError("the chain has no joint that moves; Arm needs at least one")
+        self.joint_names: tuple[str, ...] = tuple(joint.name for joint in moving)
+        self.joint_kinds: tuple[str, ...] = tuple(joint.kind for joint in moving)
+        self.num_joints = len(moving)
+        limits = {
+            "lower": [joint.lower for joint in moving],
+            "upper": [joint.upper for joint in moving],
+            "speed_limit": [joint.speed_limit if speed_limit is None else speed_limit for joint in moving],
+        }
+        for name, values in limits.items():
+            self.register_buffer(name, torch.tensor(values, dtype=torch.float64), persistent=False)
+        self.form = FORMS[form](moving, tool)
+        self.components = ComponentForm(moving, tool)
+        self.to(device=device, dtype=dtype)
 
     @classmethod
     def ur5(
@@ -70,49 +86,59 @@ class Arm(nn.Module):
         return cls.from_urdf(ur5_urdf(tool_length), tip="tool", speed_limit=UR5_SPEED_LIMIT, dtype=dtype, device=device)
 
     @classmethod
-    def from_urdf(cls, text: str, *, tip: str, **options: Any) -> Arm:
-        """Parse URDF ``text`` from its root to the link ``tip``; ``options`` go to the constructor."""
-        import pytorch_kinematics as pk
+    def from_urdf(cls, text: str, *, tip: str, base: str | None = None, **options: Any) -> Arm:
+        """The arm from the link ``base`` (default: the root) to the link ``tip`` of URDF ``text``.
 
-        tree = pk.build_chain_from_urdf(text.encode())
-        check_choice("link", tip, tree.get_link_names())
-        return cls(pk.SerialChain(tree, tip), **options)
+        Args:
+            text: the description.
+            tip: link whose frame is the tool's.
+            base: link whose frame is the base frame.
+            options: of the constructor.
+
+        Raises:
+            InputError: the text cannot be read, a link is unknown, or a joint is of a kind that `Arm` cannot handle.
+        """
+        return cls(joints_of_urdf(text, base=base, tip=tip), **options)
+
+    @classmethod
+    def from_mjcf(cls, text: str, *, tip: str, base: str | None = None, **options: Any) -> Arm:
+        """The arm from the body ``base`` (default: the world) to the body or site ``tip`` of MJCF ``text``.
+
+        MuJoCo itself, which the extra ``sim`` brings, reads the text. Arguments and errors are those of `from_urdf`.
+        """
+        return cls(joints_of_mjcf(text, base=base, tip=tip), **options)
+
+    @classmethod
+    def from_chain(cls, chain: pytorch_kinematics.SerialChain, **options: Any) -> Arm:
+        """The arm of a chain that pytorch-kinematics has parsed, as precise as the chain (float32 by default)."""
+        return cls(joints_of_chain(chain), **options)
 
     def forward(self, joint_pos: Tensor) -> Tensor:
-        """Pose of the tool, ``(*B, N)`` [rad] -> ``(*B, 4, 4)``, base frame [m]."""
-        return self.pose_and_jacobian(joint_pos)[0]
+        """Pose of the tool, ``(*B, N)`` [rad; m] -> ``(*B, 4, 4)``, base frame [m]."""
+        self.check(joint_pos)
+        if joint_pos.ndim == 2:
+            return self.form(joint_pos)
+        return self.form(joint_pos.reshape(-1, self.num_joints)).view(*joint_pos.shape[:-1], 4, 4)
 
     def pose_and_jacobian(self, joint_pos: Tensor) -> tuple[Tensor, Tensor]:
         """Pose ``(*B, 4, 4)`` [m] and geometric Jacobian ``(*B, 6, N)`` with rows [v; ω], both in the base frame.
 
         Raises:
-            InputError: ``joint_pos`` is not ``(*B, N)``.
+            InputError: ``joint_pos`` is not ``(*B, N)``, or of another device or precision than the arm.
         """
-        if not torch.compiler.is_compiling():
-            check_trailing_shape("joint_pos", joint_pos, self.num_joints)
+        self.check(joint_pos)
+        if joint_pos.ndim == 2:
+            return self.form.pose_and_jacobian(joint_pos)
         batch = joint_pos.shape[:-1]
-        flat = joint_pos.reshape(-1, self.num_joints)
-        entries = torch.addmm(self._phases, flat, self._frequencies).sin() @ self._weights
-        return entries[:, :16].view(*batch, 4, 4), entries[:, 16:].view(*batch, 6, self.num_joints)
+        pose, jacobian = self.form.pose_and_jacobian(joint_pos.reshape(-1, self.num_joints))
+        return pose.view(*batch, 4, 4), jacobian.view(*batch, 6, self.num_joints)
 
-
-def _joints(chain: pytorch_kinematics.SerialChain) -> list[Joint]:
-    """The chain's frames as joints; pytorch-kinematics keeps the offset after a joint in its link."""
-    joints: list[Joint] = []
-    for frame in chain._serial_frames:
-        if frame.joint.joint_type not in ("fixed", "revolute"):
-            raise InputError(
-                f"joint {frame.joint.name!r} is {frame.joint.joint_type}; Arm handles fixed and revolute joints"
-            )
-        before, after = _matrix(frame.joint.offset), _matrix(frame.link.offset)
-        axis = frame.joint.axis.to(torch.float64) if frame.joint.joint_type == "revolute" else None
-        joints += [Joint(offset=before, axis=axis), Joint(offset=after, axis=None)]
-    if all(joint.axis is None for joint in joints):
-        raise InputError("the chain has no joint that moves; Arm needs at least one")
-    return joints
-
-
-def _matrix(transform: pytorch_kinematics.Transform3d | None) -> Tensor:
-    if transform is None:
-        return torch.eye(4, dtype=torch.float64)
-    return transform.get_matrix()[0].to(torch.float64)
+    def check(self, joint_pos: Tensor) -> None:
+        """Raise `InputError` unless ``joint_pos`` is ``(*B, N)``, of the arm's device and precision."""
+        lower = cast(Tensor, self._buffers["lower"])
+        good = isinstance(joint_pos, Tensor) and joint_pos.dtype == lower.dtype and joint_pos.device == lower.device
+        if good and joint_pos.shape[-1:] == lower.shape:
+            return
+        check_trailing_shape("joint_pos", joint_pos, self.num_joints)
+        check_same_device("joint_pos", joint_pos, lower.device, "the arm")
+        raise InputError(f"joint_pos is {joint_pos.dtype}, but the arm is {lower.dtype}: convert one of them")

@@ -1,4 +1,4 @@
-"""Damped least squares for a tool that points straight down and stands square to the world's axes."""
+"""Damped least squares, and the error of a tool that points straight down, square to the world's axes."""
 
 import math
 
@@ -8,23 +8,26 @@ from torch import Tensor
 QUARTER_TURN = math.pi / 2
 
 
-def dls_step(jacobian: Tensor, error: Tensor, damping: float) -> Tensor:
+def dls_step(jacobian: Tensor, error: Tensor, damping: float | Tensor, *, preferred: Tensor | None = None) -> Tensor:
     """Joint step of damped least squares, Δq = Jᵀ(JJᵀ + λ²I)⁻¹e (Wampler 1986; Nakamura & Hanafusa 1986).
 
     Args:
-        jacobian: ``(*B, 6, N)``, rows [v; ω].
-        error: ``(*B, 6)``, the twist still to go [m; rad].
-        damping: λ > 0; at a singular configuration it bounds the step by ``|e| / 2λ``.
+        jacobian: ``(*B, R, N)``, rows [v; ω] or the task's part of them.
+        error: ``(*B, R)``, the twist still to go [m; rad].
+        damping: λ > 0, a number or ``(*B,)``; at a singular configuration it bounds the step by ``|e| / 2λ``.
+        preferred: ``(*B, N)``, a step of which the part is added that the task leaves free (Liégeois 1977).
 
     Returns:
         ``(*B, N)`` [rad].
     """
-    # Dividing rows and columns by λ keeps float32 well-conditioned: (JJᵀ/λ² + I).
-    scaled = jacobian / damping
-    gram = scaled @ scaled.mT + torch.eye(6, dtype=scaled.dtype, device=scaled.device)
+    if preferred is not None:
+        error = error - (jacobian @ preferred.unsqueeze(-1)).squeeze(-1)
+    gram = jacobian @ jacobian.mT
+    square = damping.square().unsqueeze(-1) if isinstance(damping, Tensor) else damping**2
+    gram.diagonal(dim1=-2, dim2=-1).add_(square)
     factor, _ = torch.linalg.cholesky_ex(gram)
-    weights = torch.cholesky_solve(error.unsqueeze(-1) / damping, factor)
-    return (scaled.mT @ weights).squeeze(-1)
+    step = (jacobian.mT @ torch.cholesky_solve(error.unsqueeze(-1), factor)).squeeze(-1)
+    return step if preferred is None else step + preferred
 
 
 def upright_error(rotation: Tensor) -> Tensor:

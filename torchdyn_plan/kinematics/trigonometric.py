@@ -1,118 +1,134 @@
-"""Exact trigonometric form of a revolute chain: its pose and Jacobian as one matrix product of sines.
+"""Exact trigonometric form of a chain: its pose and Jacobian as one matrix product of sines.
 
 Every entry of the forward kinematics of a revolute chain is a polynomial in cos qᵢ and sin qᵢ, hence a finite Fourier
 series in integer combinations of the joint angles. Multiplying the chain's transforms as such series is exact (no
-fit); what remains at run time is ``sin(q·C + b) · W``.
+fit), and each joint adds a frequency of its own, so that terms never collide; what remains at run time is
+``c + sin(q·C + b) · W``. Prismatic joints before the first revolute one shift the place alone and add ``q · L``; a
+prismatic joint after a revolute one multiplies sines by q and has no such form.
 """
+
+from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import torch
 from torch import Tensor
 
-_NEGLIGIBLE = 1e-12
+from torchdyn_plan.errors import InputError
+from torchdyn_plan.kinematics.joint import Joint, cross_matrix
 
-Series = dict[tuple[int, ...], Tensor]
-"""Coefficient of ``exp(i k·q)`` for each integer vector k; coefficients are complex tensors of one shape."""
+NEGLIGIBLE = 1e-12
 
 
-@dataclass(frozen=True, kw_only=True)
-class Joint:
-    """One step along a chain: a fixed transform, then (if ``axis`` is given) a rotation about that axis."""
+class Series(NamedTuple):
+    """A finite Fourier series, Σ coefficientᵢ exp(i kᵢ·q)."""
 
-    offset: Tensor
-    """``(4, 4)`` float64, from the previous frame [m]."""
-    axis: Tensor | None
-    """``(3,)`` unit vector in the joint's own frame, or None for a fixed joint."""
+    frequencies: Tensor
+    """``(M, N)`` float64, integers."""
+    coefficients: Tensor
+    """``(M, …)`` complex128."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class TrigonometricForm:
-    """Constants of ``sin(q·frequencies + phases) · weights``, all float64."""
+    """Constants of ``constant + sin(q·frequencies + phases) · weights + q·slopes``, all float64.
+
+    The entries are the rows of the pose, each followed by the same row of the Jacobian: rotation, place, J_v and J_ω.
+    """
 
     frequencies: Tensor
     """``(N, M)``, integers."""
     phases: Tensor
     """``(M,)`` [rad]"""
     weights: Tensor
-    """``(M, 16 + 6N)``: the pose row by row, then the Jacobian row by row, [v; ω] in the base frame."""
+    """``(M, 3, 4 + 2N)``"""
+    constant: Tensor
+    """``(3, 4 + 2N)``"""
+    slopes: Tensor | None
+    """``(N, 3, 4 + 2N)``: what prismatic joints add; None where there are none."""
 
 
-def trigonometric_form(chain: Sequence[Joint]) -> TrigonometricForm:
-    """Expand ``chain`` (base to tip) exactly; terms below 1e-12 of the entries' size are rounding and dropped."""
-    count = sum(joint.axis is not None for joint in chain)
-    pose: Series = {(0,) * count: torch.eye(4, dtype=torch.complex128)}
+def trigonometric_form(joints: Sequence[Joint], tool: Tensor, *, negligible: float = NEGLIGIBLE) -> TrigonometricForm:
+    """Expand a chain exactly.
+
+    Args:
+        joints: those that move, base to tip.
+        tool: ``(4, 4)``, from the last joint's frame to the tool.
+        negligible: terms smaller than this [m, or as entries of a rotation] are rounding and dropped.
+
+    Raises:
+        InputError: a prismatic joint follows a revolute one.
+    """
+    count = len(joints)
+    pose = Series(torch.zeros(1, count, dtype=torch.float64), torch.eye(4, dtype=torch.complex128).unsqueeze(0))
     axes: list[Series] = []
-    for joint in chain:
-        pose = _times(pose, {(0,) * count: joint.offset.to(torch.complex128)})
-        if joint.axis is not None:
-            axes.append(_apply(pose, joint.axis))
-            pose = _times(pose, _rotation(joint.axis, len(axes) - 1, count))
-    return _real_form(_entries(pose, axes, count), count)
+    slopes = torch.zeros(count, 3, 4 + 2 * count, dtype=torch.float64)
+    for index, joint in enumerate(joints):
+        assert joint.axis is not None
+        pose = Series(pose.frequencies, pose.coefficients @ joint.offset.to(torch.complex128))
+        axis = Series(pose.frequencies, pose.coefficients[:, :3, :3] @ joint.axis.to(torch.complex128))
+        if joint.kind == "prismatic":
+            if len(pose.coefficients) > 1:
+                raise InputError(f"prismatic joint {joint.name!r} follows a revolute one: it has no form in sines")
+            slopes[index, :, 3] = axis.coefficients[0].real
+            axes.append(Series(axis.frequencies[:0], axis.coefficients[:0]))
+        else:
+            axes.append(axis)
+            pose = _turned(pose, joint.axis, index, negligible)
+    pose = Series(pose.frequencies, pose.coefficients @ tool.to(torch.complex128))
+    entries = _entries(pose, axes, slopes)
+    return _real_form(entries, negligible, slopes if bool(slopes.any()) else None)
 
 
-def _entries(pose: Series, axes: Sequence[Series], count: int) -> Series:
-    """Series of the flat vector (pose 16, Jacobian 6N); v = ∂position/∂q, ω = the joint axes in the base frame."""
-    entries: Series = {}
-    for k in set(pose).union(*axes):
-        flat = torch.zeros(16 + 6 * count, dtype=torch.complex128)
-        if k in pose:
-            flat[:16] = pose[k].reshape(16)
-            speed = pose[k][:3, 3, None] * 1j * torch.tensor(k, dtype=torch.complex128)
-            flat[16 : 16 + 3 * count] = speed.reshape(-1)
-        turn = torch.stack([axis.get(k, torch.zeros(3, dtype=torch.complex128)) for axis in axes], dim=-1)
-        flat[16 + 3 * count :] = turn.reshape(-1)
-        entries[k] = flat
-    return entries
-
-
-def _real_form(entries: Series, count: int) -> TrigonometricForm:
-    """Pair ±k into real sines: c·e^{ikq} + conj = 2 Re(c) cos(kq) - 2 Im(c) sin(kq)."""
-    frequencies, phases, weights = [], [], []
-    for k in sorted(entries):
-        if k < (0,) * count:
-            continue
-        factor = 1.0 if not any(k) else 2.0
-        for phase, part in ((torch.pi / 2, entries[k].real), (0.0, -entries[k].imag)):
-            weight = factor * part
-            weight = torch.where(weight.abs() > _NEGLIGIBLE, weight, torch.zeros_like(weight))
-            if bool(weight.any()):
-                frequencies.append(k)
-                phases.append(phase)
-                weights.append(weight)
-    return TrigonometricForm(
-        frequencies=torch.tensor(frequencies, dtype=torch.float64).T.contiguous(),
-        phases=torch.tensor(phases, dtype=torch.float64),
-        weights=torch.stack(weights),
-    )
-
-
-def _rotation(axis: Tensor, index: int, count: int) -> Series:
-    """Rotation about ``axis`` by joint ``index`` (Rodrigues) as a series: uuᵀ + cos(q)(1 - uuᵀ) + sin(q)[u]."""
-    u = axis / axis.norm()
-    outer = torch.outer(u, u)
-    cross = torch.linalg.cross(u.expand(3, 3), torch.eye(3, dtype=u.dtype)).T
-    plus = torch.complex(0.5 * (torch.eye(3, dtype=u.dtype) - outer), -0.5 * cross)
-    fixed = torch.eye(4, dtype=torch.complex128)
+def _turned(pose: Series, axis: Tensor, index: int, negligible: float) -> Series:
+    """``pose`` times the rotation about ``axis`` by joint ``index`` (Rodrigues): uuᵀ + cos(q)(1 - uuᵀ) + sin(q)[u]."""
+    outer = torch.outer(axis, axis)
+    plus = torch.complex(0.5 * (torch.eye(3, dtype=axis.dtype) - outer), -0.5 * cross_matrix(axis))
+    fixed, turning = torch.eye(4, dtype=torch.complex128), torch.zeros(4, 4, dtype=torch.complex128)
     fixed[:3, :3] = outer.to(torch.complex128)
-    turning = torch.zeros(4, 4, dtype=torch.complex128)
     turning[:3, :3] = plus
-    up = tuple(int(i == index) for i in range(count))
-    down = tuple(-int(i == index) for i in range(count))
-    return {(0,) * count: fixed, up: turning, down: turning.conj()}
+    step = torch.zeros_like(pose.frequencies)
+    step[:, index] = 1.0
+    frequencies = torch.cat([pose.frequencies, pose.frequencies + step, pose.frequencies - step])
+    coefficients = torch.cat([pose.coefficients @ factor for factor in (fixed, turning, turning.conj())])
+    kept = coefficients.detach().abs().amax(dim=(1, 2)) > negligible
+    return Series(frequencies[kept], coefficients[kept])
 
 
-def _times(left: Series, right: Series) -> Series:
-    product: Series = {}
-    for k, a in left.items():
-        for m, b in right.items():
-            key = tuple(i + j for i, j in zip(k, m, strict=True))
-            product[key] = product[key] + a @ b if key in product else a @ b
-    return {k: c for k, c in product.items() if float(c.abs().max()) > _NEGLIGIBLE}
+def _entries(pose: Series, axes: Sequence[Series], slopes: Tensor) -> Series:
+    """Series of the rows [rotation, place, J_v, J_ω]; J_v = ∂place/∂q, J_ω = the revolute axes in the base frame."""
+    count = len(axes)
+    zero = torch.zeros(1, count, dtype=torch.float64)
+    parts = [zero, pose.frequencies, *(axis.frequencies for axis in axes)]
+    frequencies, index = torch.unique(torch.cat(parts), dim=0, return_inverse=True)
+    constant, posed, *turning = index.split([len(part) for part in parts])
+    rows = torch.zeros(len(frequencies), 3, 4 + 2 * count, dtype=torch.complex128)
+    speed = pose.coefficients[:, :3, 3, None] * 1j * pose.frequencies.unsqueeze(1)
+    rows = rows.index_put((posed,), torch.cat([pose.coefficients[:, :3], speed, 0 * speed], dim=-1))
+    for joint, (axis, place) in enumerate(zip(axes, turning, strict=True)):
+        column = torch.zeros(len(place), 3, 4 + 2 * count, dtype=torch.complex128)
+        column[:, :, 4 + count + joint] = axis.coefficients
+        rows = rows.index_put((place,), column, accumulate=True)
+    sliding = torch.zeros(1, 3, 4 + 2 * count, dtype=torch.complex128)
+    sliding[0, :, 4 : 4 + count] = slopes[:, :, 3].T
+    return Series(frequencies, rows.index_put((constant,), sliding, accumulate=True))
 
 
-def _apply(pose: Series, axis: Tensor) -> Series:
-    """Series of a joint axis turned into the base frame."""
-    vector = (axis / axis.norm()).to(torch.complex128)
-    return {k: c[:3, :3] @ vector for k, c in pose.items()}
+def _real_form(entries: Series, negligible: float, slopes: Tensor | None) -> TrigonometricForm:
+    """Pair ±k into real sines: c·e^{ikq} + conj = 2 Re(c) cos(kq) - 2 Im(c) sin(kq)."""
+    # The sign of a vector's first entry that is not zero.
+    sign = (entries.frequencies.sign() * 2.0 ** -torch.arange(entries.frequencies.shape[1])).sum(dim=1)
+    frequencies, rows = entries.frequencies[sign > 0], entries.coefficients[sign > 0]
+    weights = torch.cat([2.0 * rows.real, -2.0 * rows.imag])
+    phases = torch.zeros(len(weights), dtype=torch.float64)
+    phases[: len(rows)] = torch.pi / 2
+    kept = weights.detach().abs().amax(dim=(1, 2)) > negligible
+    return TrigonometricForm(
+        frequencies=frequencies.repeat(2, 1)[kept].T.contiguous(),
+        phases=phases[kept],
+        weights=weights[kept],
+        constant=entries.coefficients[sign == 0][0].real,
+        slopes=slopes,
+    )

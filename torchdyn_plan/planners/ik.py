@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+import functools
+import math
+from collections.abc import Sequence
 from functools import partial
 from typing import Any
 
@@ -14,40 +16,13 @@ from torch import Tensor, nn
 from torchdyn_plan import keys
 from torchdyn_plan.checks import check_finite, check_number, check_trailing_shape
 from torchdyn_plan.kinematics.arm import Arm
-from torchdyn_plan.kinematics.dls import dls_step, limited_step, upright_error
+from torchdyn_plan.kinematics.components import Vector, damped_least_squares
+from torchdyn_plan.kinematics.dls import dls_step, limited_step
+from torchdyn_plan.kinematics.fused import Columns, Fused, filled
+from torchdyn_plan.planners.approach import Approach, square_turn, tool_target, way_to
 from torchdyn_plan.planners.protocol import read
 
 PATH_NAMES = ("path_pos", "path_step", "path_goal")
-
-
-@dataclass(frozen=True, kw_only=True)
-class Approach:
-    """How goals become tool positions: where the table is, how high to travel, where the box may stand."""
-
-    base_pos: tuple[float, float, float] = (0.0, -0.855, 0.05)
-    """Position of the arm's base frame in the world, axes parallel [m]."""
-    tool_length: float = 0.084
-    """Distance of the box mouth from the flange [m]."""
-    table_height: float = 0.052
-    """Goals at or below this height are on the table: the box is dropped over them [m]."""
-    down_height: float = 0.006
-    """Height of the box mouth when it is down [m]."""
-    travel_height: float = 0.099
-    """Height of the box mouth on its way to a goal on the table, above the ball [m]."""
-    clear_height: float = 0.089
-    """Below this the box slows sideways as it lifts, and 2 cm below it stands still sideways [m]."""
-    drop_distance: float = 0.045
-    """Horizontal distance from the goal within which the box drops [m]."""
-    half_extent: float = 0.722
-    """The tool's place is clamped to the square of this half-side, which keeps the box clear of the rails [m]."""
-    min_radius: float = 0.1
-    """The tool keeps at least this distance from the arm's vertical axis [m]."""
-    max_radius: float = 0.91
-    """The tool keeps at most this distance from the arm's vertical axis [m]."""
-
-    def __post_init__(self) -> None:
-        for name in ("tool_length", "down_height", "travel_height", "drop_distance", "half_extent", "max_radius"):
-            check_number(name, getattr(self, name), minimum=0.0)
 
 
 class IKPlanner(TensorDictModuleBase):
@@ -61,7 +36,6 @@ class IKPlanner(TensorDictModuleBase):
     """
 
     PATH_LENGTH = 5
-    _base: Tensor
     _limit: Tensor
 
     def __init__(
@@ -73,6 +47,7 @@ class IKPlanner(TensorDictModuleBase):
         damping: float = 0.02,
         gain: float = 0.25,
         chunk: int | None = None,
+        compiled: bool = False,
     ) -> None:
         """Plan for ``arm`` (the UR5 of Trapper by default) at ``control_step`` [s].
 
@@ -83,6 +58,9 @@ class IKPlanner(TensorDictModuleBase):
             damping: λ of the least squares.
             gain: share of the remaining joint error that one step may cover, which brakes the arm at the end.
             chunk: solve in blocks of exactly this many rows, so that results do not depend on the batch size.
+            compiled: solve in one compiled loop, which takes a C++ compiler and some seconds at the first call (less
+                where torch finds it in its cache); actions are the same but for rounding, do not depend on the batch
+                size, and have no derivatives.
         """
         super().__init__()
         if chunk is not None:
@@ -93,7 +71,7 @@ class IKPlanner(TensorDictModuleBase):
         self.approach = approach or Approach()
         self.arm = arm or Arm.ur5(tool_length=self.approach.tool_length)
         self.damping, self.gain, self.chunk = damping, gain, chunk
-        self.register_buffer("_base", torch.tensor(self.approach.base_pos, dtype=self.arm.lower.dtype), False)
+        self._fused = Fused(self._fused_step) if compiled else None
         self.register_buffer("_limit", self.arm.speed_limit * control_step, False)
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
@@ -129,7 +107,7 @@ class IKPlanner(TensorDictModuleBase):
 
     def _step_rows(self, joint_pos: Tensor, goal: Tensor) -> tuple[Tensor, Tensor]:
         """`step`, in blocks of ``chunk`` rows if there is one."""
-        if self.chunk is None:
+        if self.chunk is None or self._fused is not None:
             return self.step(joint_pos, goal)
         batch, padding = joint_pos.shape, (0, 0, 0, -joint_pos.shape[:-1].numel() % self.chunk)
         rows = [nn.functional.pad(value.reshape(-1, value.shape[-1]), padding) for value in (joint_pos, goal)]
@@ -141,7 +119,7 @@ class IKPlanner(TensorDictModuleBase):
         check_trailing_shape(keys.JOINT_POS, joint_pos, self.arm.num_joints)
         check_trailing_shape(keys.GOAL, goal, *joint_pos.shape[:-1], 3)
         # The sum is a quick look: only a sum that is not finite is worth the full one.
-        if not torch.isfinite(goal.sum()):
+        if not math.isfinite(goal.sum().item()):
             check_finite(keys.GOAL, goal)
 
     def path(self, joint_pos: Tensor, goal: Tensor) -> Tensor:
@@ -158,14 +136,42 @@ class IKPlanner(TensorDictModuleBase):
         Returns:
             The action ``(*B, N)`` and the joint angles to which the path has come ``(*B, N)`` [rad].
         """
-        joint_pos, goal = joint_pos.to(self._base.dtype), goal.to(self._base.dtype)
-        target, on_table = self.tool_target(goal)
+        joint_pos, goal = joint_pos.to(self._limit.dtype), goal.to(self._limit.dtype)
+        if self._fused is not None:
+            if joint_pos.ndim == 2:
+                action, reached = self._fused(joint_pos, goal)
+                return action, reached
+            rows = self._fused(joint_pos.reshape(-1, joint_pos.shape[-1]), goal.reshape(-1, 3))
+            action, reached = (value.reshape(joint_pos.shape) for value in rows)
+            return action, reached
         pose, jacobian = self._pose_and_jacobian(joint_pos)
-        way = way_to(pose[..., :3, 3], target - self._base, on_table, self.approach, self._base[2])
-        error = torch.cat([way, upright_error(pose[..., :3, :3])], dim=-1)
+        error = torch.stack(self._error(pose.flatten(-2).unbind(-1), goal.unbind(-1)), dim=-1)
         step = limited_step(dls_step(jacobian, error, self.damping), self._limit, self.gain)
         step = torch.clamp(step, self.arm.lower - joint_pos, self.arm.upper - joint_pos)
         return (step / self._limit).clamp(-1.0, 1.0), joint_pos + step
+
+    def _error(self, pose: Sequence[Tensor], goal: Sequence[Tensor]) -> list[Tensor]:
+        """The twist still to go [m; rad], six columns, from a pose row by row and a goal x, y, z [m, world]."""
+        x, y, height, on_table = tool_target(goal, self.approach)
+        tool = pose[3], pose[7], pose[11] + self.approach.base_pos[2]
+        way = way_to(tool, (x, y, height), on_table, self.approach)
+        # Straight down is the tilt z_tool × (-z), for small angles.
+        return [*way, -pose[6], pose[2], square_turn(pose[0], pose[4])]
+
+    def _fused_step(self, joint_pos: Columns, goal: Columns) -> tuple[Vector, Vector]:
+        """`step`, column by column."""
+        rotation, place, jacobian = self.arm.components(joint_pos)
+        pose = [entry for row, end in zip(rotation, place, strict=True) for entry in (*row, end)]
+        error = self._error([filled(entry, joint_pos[0]) for entry in pose], goal)
+        step = [filled(value, goal[0]) for value in damped_least_squares(jacobian, error, self.damping)]
+        limit, lower, upper = (values.tolist() for values in (self._limit, self.arm.lower, self.arm.upper))
+        worst = functools.reduce(torch.maximum, [value.abs() / most for value, most in zip(step, limit, strict=True)])
+        share = (1.0 / worst.clamp_min(1e-12)).clamp(max=self.gain)
+        bounds = zip(joint_pos, lower, upper, strict=True)
+        ways = [(low - here, high - here) for here, low, high in bounds]
+        step = [torch.clamp(value * share, *way) for value, way in zip(step, ways, strict=True)]
+        action = [(value / most).clamp(-1.0, 1.0) for value, most in zip(step, limit, strict=True)]
+        return action, [here + value for here, value in zip(joint_pos, step, strict=True)]
 
     def _pose_and_jacobian(self, joint_pos: Tensor) -> tuple[Tensor, Tensor]:
         """The arm's, from products of always ``chunk`` rows where ``joint_pos`` is a multiple of them."""
@@ -173,43 +179,3 @@ class IKPlanner(TensorDictModuleBase):
             return self.arm.pose_and_jacobian(joint_pos)
         pose, jacobian = zip(*map(self.arm.pose_and_jacobian, joint_pos.split(self.chunk)), strict=True)
         return torch.cat(pose), torch.cat(jacobian)
-
-    def tool_target(self, goal: Tensor) -> tuple[Tensor, Tensor]:
-        """Place of the box mouth for ``goal`` (*B, 3), both [m, world], and whether the goal is on the table (*B,)."""
-        a = self.approach
-        on_table = goal[..., 2] <= a.table_height
-        place = goal[..., :2].clamp(-a.half_extent, a.half_extent) - self._base[:2]
-        radius = place.norm(dim=-1, keepdim=True).clamp_min(1e-6)
-        place = place * (radius.clamp(a.min_radius, a.max_radius) / radius) + self._base[:2]
-        place = place.clamp(-a.half_extent, a.half_extent)
-        height = torch.where(on_table, a.down_height, goal[..., 2])
-        return torch.cat([place, height.unsqueeze(-1)], dim=-1), on_table
-
-
-def way_to(tool: Tensor, target: Tensor, on_table: Tensor, approach: Approach, base_height: Tensor | float) -> Tensor:
-    """Displacement that a tool has still to make, ``(*B, 3)`` [m], as a velocity direction at ``tool``.
-
-    Sideways the way is taken in polar coordinates about the arm's axis (out of its own way, pan and reach at once).
-    A goal on the table is approached at the travel height; the box drops within the drop distance, and a box more
-    than 2 cm below the clear height lifts before it moves.
-
-    Args:
-        tool: ``(*B, 3)`` [m], base frame.
-        target: ``(*B, 3)`` [m], base frame.
-        on_table: ``(*B,)`` bool.
-        approach: heights and distances.
-        base_height: height of the base above the table [m].
-    """
-    x, y, z = tool.unbind(-1)
-    goal_x, goal_y, goal_z = target.unbind(-1)
-    radius = torch.hypot(x, y).clamp_min(1e-6)
-    away = torch.hypot(goal_x - x, goal_y - y)
-    forward = (torch.hypot(goal_x, goal_y) - radius) / radius
-    turn = torch.atan2(x * goal_y - y * goal_x, x * goal_x + y * goal_y)
-    side = torch.stack([x * forward - y * turn, y * forward + x * turn], dim=-1)
-    far = ((away - approach.drop_distance) / 0.015).clamp(0.0, 1.0)
-    height, lift = z + base_height, approach.travel_height - approach.down_height
-    wanted = goal_z + base_height + torch.where(on_table, lift * far, 0.0)
-    low = torch.maximum(far, (~on_table).to(far.dtype)) * (approach.clear_height - height) / 0.02
-    side = side * (1.0 - low.clamp(0.0, 1.0)).unsqueeze(-1)
-    return torch.cat([side, (wanted - height).unsqueeze(-1)], dim=-1)

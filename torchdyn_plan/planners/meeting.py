@@ -7,7 +7,7 @@ from functools import partial
 from typing import Any
 
 import torch
-from tensordict import NestedKey, TensorDict, TensorDictBase
+from tensordict import TensorDict, TensorDictBase
 from torch import Tensor
 
 from torchdyn_plan import keys
@@ -73,8 +73,8 @@ class MeetingPlanner(DynamicPlanner):
         for name, value in (("table_height", table_height), ("pull", pull)):
             check_number(name, value, minimum=0.0)
         self.drop, self.table_height, self.pull, self.lead = drop or Drop(), table_height, pull, lead
-        written: list[Any] = [(keys.PLAN, name) for name in DROP_NAMES]
-        self.out_keys = [*self.out_keys, *written]
+        written: list[Any] = list(self.out_keys)
+        self.out_keys = written + [(keys.PLAN, name) for name in DROP_NAMES]
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         """Plan where a plan is due, wait or drop, and act; raises what `DynamicPlanner.forward` raises."""
@@ -95,8 +95,10 @@ class MeetingPlanner(DynamicPlanner):
         meeting = SearchResult(*planned)
 
         path = self._path(outlook, age)
-        started = clock.replans > 0
-        drop_step = self._drop_step(drop_step, path, tool_pos, tool_pos - tool_before, target_pos, started)
+        drop_step = self._drop_step(
+            drop_step, path, tool_pos=tool_pos, tool_before=tool_before, target_pos=target_pos,
+            started=clock.replans > 0,
+        )  # fmt: skip
         remember(tensordict, clock, meeting, replanned=due)
         entries = dict(zip(DROP_NAMES, (outlook, age + 1, drop_step, tool_pos), strict=True))
         plan = tensordict.get(keys.PLAN)
@@ -160,15 +162,16 @@ class MeetingPlanner(DynamicPlanner):
         self,
         drop_step: Tensor,
         path: Tensor,
+        *,
         tool_pos: Tensor,
-        tool_step: Tensor,
+        tool_before: Tensor,
         target_pos: Tensor,
         started: Tensor,
     ) -> Tensor:
         """Steps since the drop began, -1 for none: begins when it is best to begin now, ends when it has missed."""
         drop = self.drop
         step = torch.where(drop_step >= 0, drop_step + 1, drop_step)
-        clearance = drop.clearance(path, tool_pos, tool_step)
+        clearance = drop.clearance(path, tool_pos, tool_pos - tool_before)
         now = (clearance.argmax(-1) == 0) & (clearance[..., 0] > 0.0)
         above = (tool_pos[..., 2] > 0.95 * 2 * drop.radius) & (path[..., 2] > 0.0).all(-1)
         step = torch.where((step < 0) & started & now & above, 0, step)

@@ -1,0 +1,206 @@
+"""The two ways in which an arm is evaluated: one product of sines, or a product of a few transforms made of sines."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Sequence
+from functools import cache
+from itertools import combinations, pairwise
+from typing import cast
+
+import torch
+from torch import Tensor, nn
+
+from torchdyn_plan.errors import InputError
+from torchdyn_plan.kinematics.joint import Joint
+from torchdyn_plan.kinematics.trigonometric import NEGLIGIBLE, TrigonometricForm, trigonometric_form
+
+MOST_SINES = 128
+"""More sines than this in one product cost more than a product of transforms."""
+
+
+class SineForm(nn.Module):
+    """Pose and Jacobian as ``sin(q·C + b) · W``, three tensor operations; the constant is a sine of frequency 0."""
+
+    _frequencies: Tensor
+    _phases: Tensor
+    _weights: Tensor
+    _slopes: Tensor | None
+
+    def __init__(self, form: TrigonometricForm) -> None:
+        """Lay the entries of ``form`` out as a pose ``(4, 4)`` and a Jacobian ``(6, N)``, one after the other."""
+        super().__init__()
+        self.num_joints = len(form.frequencies)
+        constant = _laid_out(form.constant.unsqueeze(0), 1.0)
+        _register(self, "_frequencies", torch.nn.functional.pad(form.frequencies, (1, 0)))
+        _register(self, "_phases", torch.nn.functional.pad(form.phases, (1, 0), value=torch.pi / 2))
+        _register(self, "_weights", torch.cat([constant, _laid_out(form.weights, 0.0)]))
+        _register(self, "_slopes", None if form.slopes is None else _laid_out(form.slopes, 0.0))
+
+    def forward(self, joint_pos: Tensor) -> Tensor:
+        """Pose ``(B, 4, 4)`` alone, for ``(B, N)``."""
+        sines = torch.addmm(self._phases, joint_pos, self._frequencies).sin()
+        pose = torch.mm(sines, self._weights[:, :16])
+        if self._slopes is not None:
+            pose = torch.addmm(pose, joint_pos, self._slopes[:, :16])
+        return pose.view(-1, 4, 4)
+
+    def pose_and_jacobian(self, joint_pos: Tensor) -> tuple[Tensor, Tensor]:
+        """Pose ``(B, 4, 4)`` and Jacobian ``(B, 6, N)``, for ``(B, N)``."""
+        # A module's attribute that is a buffer takes as long to look up as a small operation; its table does not.
+        own = cast(dict[str, Tensor], self._buffers)
+        sines = torch.addmm(own["_phases"], joint_pos, own["_frequencies"]).sin()
+        entries = torch.mm(sines, own["_weights"])
+        if own["_slopes"] is not None:
+            entries = torch.addmm(entries, joint_pos, own["_slopes"])
+        pose, jacobian = entries.split_with_sizes((16, 6 * self.num_joints), dim=-1)
+        return pose.view(-1, 4, 4), jacobian.view(-1, 6, self.num_joints)
+
+
+class TransformForm(nn.Module):
+    """Pose and Jacobian as a product of transforms, each of a few neighbouring joints and itself a product of sines."""
+
+    _frequencies: Tensor
+    _phases: Tensor
+    _weights: Tensor
+    _constant: Tensor
+    _slopes: Tensor | None
+    _last_row: Tensor
+
+    def __init__(self, forms: Sequence[TrigonometricForm]) -> None:
+        """Put the transforms, base to tip, side by side: all their sines are taken at once."""
+        super().__init__()
+        self.counts = tuple(len(form.frequencies) for form in forms)
+        _register(self, "_frequencies", torch.block_diag(*(form.frequencies for form in forms)))
+        _register(self, "_phases", torch.cat([form.phases for form in forms]))
+        _register(self, "_weights", torch.block_diag(*(form.weights.flatten(1) for form in forms)))
+        _register(self, "_constant", torch.cat([form.constant.flatten() for form in forms]))
+        slides = any(form.slopes is not None for form in forms)
+        _register(self, "_slopes", torch.block_diag(*map(_slopes, forms)) if slides else None)
+        _register(self, "_last_row", torch.tensor([[[0.0, 0.0, 0.0, 1.0]]]))
+
+    def forward(self, joint_pos: Tensor) -> Tensor:
+        """Pose ``(B, 4, 4)`` alone, for ``(B, N)``."""
+        first, *others = self._transforms(joint_pos)
+        rotation, place = first[..., :3], first[..., 3:4]
+        for other in others:
+            moved = rotation @ other[..., :4]
+            rotation, place = moved[..., :3], place + moved[..., 3:]
+        return self._pose(torch.cat([rotation, place], dim=-1))
+
+    def pose_and_jacobian(self, joint_pos: Tensor) -> tuple[Tensor, Tensor]:
+        """Pose ``(B, 4, 4)`` and Jacobian ``(B, 6, N)``, for ``(B, N)``.
+
+        A transform behind another is turned by it, and lengthens its joints' levers: v = v₁ + ω₁ × (R₁p₂).
+        """
+        first, *others = self._transforms(joint_pos)
+        counts = iter(self.counts)
+        rotation, place, speed, turn = first.split((3, 1, count := next(counts), count), dim=-1)
+        for other in others:
+            moved = rotation @ other
+            rotation, lever, speed_here, turn_here = moved.split((3, 1, count := next(counts), count), dim=-1)
+            speed = torch.cat([speed + torch.linalg.cross(turn, lever.expand_as(turn), dim=-2), speed_here], dim=-1)
+            place, turn = place + lever, torch.cat([turn, turn_here], dim=-1)
+        return self._pose(torch.cat([rotation, place], dim=-1)), torch.cat([speed, turn], dim=-2)
+
+    def _transforms(self, joint_pos: Tensor) -> list[Tensor]:
+        """Rows [rotation, place, J_v, J_ω] of each transform, ``(B, 3, 4 + 2n)``."""
+        sines = torch.addmm(self._phases, joint_pos, self._frequencies).sin()
+        entries = torch.addmm(self._constant, sines, self._weights)
+        if self._slopes is not None:
+            entries = torch.addmm(entries, joint_pos, self._slopes)
+        parts = entries.split([12 + 6 * count for count in self.counts], dim=-1)
+        return [part.unflatten(-1, (3, -1)) for part in parts]
+
+    def _pose(self, rows: Tensor) -> Tensor:
+        return torch.cat([rows, self._last_row.expand(rows.shape[0], 1, 4)], dim=-2)
+
+
+def sine_form(joints: Sequence[Joint], tool: Tensor) -> SineForm:
+    """The whole chain as one product of sines.
+
+    Raises:
+        InputError: a prismatic joint follows a revolute one.
+    """
+    return SineForm(trigonometric_form(joints, tool, negligible=_negligible(joints, tool)))
+
+
+def transform_form(joints: Sequence[Joint], tool: Tensor) -> TransformForm:
+    """The chain as the product of the fewest transforms that have at most `MOST_SINES` sines in all."""
+    negligible = _negligible(joints, tool)
+
+    @cache
+    def form(start: int, stop: int) -> TrigonometricForm | None:
+        last = tool if stop == len(joints) else torch.eye(4, dtype=torch.float64)
+        try:
+            return trigonometric_form(joints[start:stop], last, negligible=negligible)
+        except InputError:
+            return None
+
+    best: list[TrigonometricForm] = []
+    for cuts in _cuts(len(joints)):
+        forms = [form(*cut) for cut in pairwise(cuts)]
+        kept = [one for one in forms if one is not None]
+        if len(kept) < len(forms):
+            continue
+        if best and len(kept) > len(best) and _sines(best) <= MOST_SINES:
+            break
+        if not best or _sines(kept) < _sines(best):
+            best = kept
+    return TransformForm(best)
+
+
+def best_form(joints: Sequence[Joint], tool: Tensor) -> SineForm | TransformForm:
+    """One product of sines where the chain has one of at most `MOST_SINES` sines, else a product of transforms."""
+    # The first joints alone tell of a chain whose whole expansion would be large.
+    for count in range(1, len(joints) + 1):
+        try:
+            form = trigonometric_form(joints[:count], tool, negligible=_negligible(joints, tool))
+        except InputError:
+            return transform_form(joints, tool)
+        if len(form.phases) > MOST_SINES:
+            return transform_form(joints, tool)
+    return sine_form(joints, tool)
+
+
+FORMS: dict[str, Callable[[Sequence[Joint], Tensor], SineForm | TransformForm]] = {
+    "auto": best_form,
+    "sines": sine_form,
+    "transforms": transform_form,
+}
+"""Name of each form of an arm, and what makes it."""
+
+
+def _slopes(form: TrigonometricForm) -> Tensor:
+    """What the joints add that is linear, ``(N, 12 + 6N)``."""
+    if form.slopes is not None:
+        return form.slopes.flatten(1)
+    return torch.zeros(len(form.frequencies), form.constant.numel(), dtype=torch.float64)
+
+
+def _cuts(count: int) -> Iterator[tuple[int, ...]]:
+    """Ways to cut a chain of ``count`` joints into neighbouring parts, the fewest parts first, at least two."""
+    for parts in range(min(2, count), count + 1):
+        for inner in combinations(range(1, count), parts - 1):
+            yield (0, *inner, count)
+
+
+def _sines(forms: Sequence[TrigonometricForm]) -> int:
+    return sum(len(form.phases) for form in forms)
+
+
+def _negligible(joints: Sequence[Joint], tool: Tensor) -> float:
+    """Below what terms are dropped: none where offsets have gradients, since a term that is zero may have a slope."""
+    graded = tool.requires_grad or any(joint.offset.requires_grad for joint in joints)
+    return -1.0 if graded else NEGLIGIBLE
+
+
+def _laid_out(rows: Tensor, corner: float) -> Tensor:
+    """Entries ``(M, 3, 4 + 2N)`` as flat poses and Jacobians ``(M, 16 + 6N)``, with ``corner`` last in the pose."""
+    count = (rows.shape[-1] - 4) // 2
+    pose, speed, turn = rows.split((4, count, count), dim=-1)
+    last = rows.new_tensor([0.0, 0.0, 0.0, corner]).expand(len(rows), 4)
+    return torch.cat([pose.flatten(1), last, speed.flatten(1), turn.flatten(1)], dim=1)
+
+
+def _register(module: nn.Module, name: str, value: Tensor | None) -> None:
+    module.register_buffer(name, value, persistent=False)

@@ -1,0 +1,106 @@
+"""What an arm is asked for, a whole pose or less, and how far a pose is from it."""
+
+from __future__ import annotations
+
+import math
+
+import torch
+from torch import Tensor
+
+TASKS = {"pose": 6, "axis": 5, "position": 3}
+"""Number of constrained directions of each task: the whole pose, place and direction of the tool's z axis, place."""
+
+
+def task_error(pose: Tensor, target: Tensor, *, task: str = "pose", symmetry: int = 1) -> Tensor:
+    """What is left to go from ``pose`` to ``target``: its place, then its turn.
+
+    Args:
+        pose: ``(*B, 4, 4)``, base frame.
+        target: ``(*B, 4, 4)``, base frame.
+        task: one of `TASKS`.
+        symmetry: the tool is the same after one ``symmetry``-th of a turn about its z axis: 4 for a square box.
+
+    Returns:
+        ``(*B, R)`` [m; rad]. For a pose the turn is a rotation vector in the base frame; for an axis, the turn about
+        the target's x and y axes that brings the tool's z axis there.
+    """
+    way = target[..., :3, 3] - pose[..., :3, 3]
+    if task == "position":
+        return way
+    turned, wanted = pose[..., :3, :3], target[..., :3, :3]
+    if task == "axis":
+        return torch.cat([way, _tilt(turned[..., 2], wanted)], dim=-1)
+    if symmetry > 1:
+        wanted = wanted @ _nearest_turn(wanted.mT @ turned, symmetry)
+    return torch.cat([way, rotation_vector(wanted @ turned.mT)], dim=-1)
+
+
+def task_jacobian(jacobian: Tensor, target: Tensor, *, task: str = "pose") -> Tensor:
+    """Rows of the Jacobian ``(*B, 6, N)`` that move along `task_error`: ``(*B, R, N)``."""
+    if task == "pose":
+        return jacobian
+    if task == "position":
+        return jacobian[..., :3, :]
+    return torch.cat([jacobian[..., :3, :], target[..., :3, :2].mT @ jacobian[..., 3:, :]], dim=-2)
+
+
+def rotation_vector(rotation: Tensor) -> Tensor:
+    """Axis times angle in [0, π] of rotations ``(*B, 3, 3)``: ``(*B, 3)`` [rad].
+
+    The antisymmetric part gives sin(θ)·axis, whose ratio to θ is smooth at 0; within 0.06 of a half turn, where it
+    vanishes, the axis comes from the symmetric part, in which cos(θ) is -1. Its gradient is exact near no rotation.
+    """
+    sine = 0.5 * torch.stack(
+        [
+            rotation[..., 2, 1] - rotation[..., 1, 2],
+            rotation[..., 0, 2] - rotation[..., 2, 0],
+            rotation[..., 1, 0] - rotation[..., 0, 1],
+        ],
+        dim=-1,
+    )
+    cosine = 0.5 * (rotation.diagonal(dim1=-2, dim2=-1).sum(dim=-1, keepdim=True) - 1.0)
+    vector = sine * _angle_over_sine(sine, cosine)
+    return torch.where(cosine < -0.998, _near_half_turn(rotation, sine, cosine), vector)
+
+
+def _angle_over_sine(sine: Tensor, cosine: Tensor) -> Tensor:
+    """θ / sin θ from ``sine`` (*B, 3), sin(θ)·axis, and ``cosine`` (*B, 1); 1 + sin²(θ)/6 where θ is small."""
+    square = (sine * sine).sum(dim=-1, keepdim=True)
+    small = (square < 1e-8) & (cosine > 0)
+    norm = torch.where(square < 1e-30, 1e-30, square).sqrt()
+    norm = torch.where(small, 1.0, norm)
+    # tan(θ/2) = sin(θ) / (1 + cos(θ)); atan2 rounds differently with the place of a row in its batch.
+    return torch.where(small, 1.0 + square / 6.0, 2.0 * torch.atan(norm / (1.0 + cosine).clamp_min(1e-12)) / norm)
+
+
+def _near_half_turn(rotation: Tensor, sine: Tensor, cosine: Tensor) -> Tensor:
+    """Rotation vector from R + Rᵀ = 2 cos(θ) 1 + 2 (1 - cos(θ)) uuᵀ, whose largest column is the surest."""
+    level = cosine.unsqueeze(-1) * torch.eye(3, dtype=rotation.dtype, device=rotation.device)
+    outer = 0.5 * (rotation + rotation.mT) - level
+    # As a mask and a sum, since indexing by a tensor cannot be traced through every transform.
+    diagonal = outer.diagonal(dim1=-2, dim2=-1)
+    chosen = (diagonal == diagonal.amax(dim=-1, keepdim=True)).to(outer.dtype)
+    axis = (outer * chosen.unsqueeze(-2)).sum(dim=-1)
+    axis = axis / (axis * axis).sum(dim=-1, keepdim=True).clamp_min(1e-30).sqrt()
+    along = (axis * sine).sum(dim=-1, keepdim=True)
+    return axis * (math.pi + torch.atan(along.abs() / cosine)) * torch.where(along < 0, -1.0, 1.0)
+
+
+def _tilt(axis: Tensor, wanted: Tensor) -> Tensor:
+    """Turn ``(*B, 2)`` about x and y of ``wanted`` (*B, 3, 3) that brings ``axis`` (*B, 3) to its z axis."""
+    x, y, z = (wanted.mT @ axis.unsqueeze(-1)).squeeze(-1).unbind(-1)
+    # (x, y, z) × (0, 0, 1) = (y, -x, 0); exactly opposite axes may turn either way.
+    sine = torch.stack([y, -x], dim=-1)
+    opposite = ((sine * sine).sum(dim=-1) < 1e-12) & (z < 0)
+    half_turn = sine.new_tensor([math.pi, 0.0])
+    return torch.where(opposite.unsqueeze(-1), half_turn, sine * _angle_over_sine(sine, z.unsqueeze(-1)))
+
+
+def _nearest_turn(relative: Tensor, symmetry: int) -> Tensor:
+    """The turn about z by a multiple of 2π/symmetry that is nearest to ``relative``, both ``(*B, 3, 3)``."""
+    part = 2.0 * math.pi / symmetry
+    sine, cosine = relative[..., 1, 0] - relative[..., 0, 1], relative[..., 0, 0] + relative[..., 1, 1]
+    angle = part * torch.round(torch.atan2(sine, cosine) / part).detach()
+    cos, sin, zero = angle.cos(), angle.sin(), torch.zeros_like(angle)
+    rows = [cos, -sin, zero, sin, cos, zero, zero, zero, zero + 1.0]
+    return torch.stack(rows, dim=-1).unflatten(-1, (3, 3))
