@@ -13,7 +13,7 @@ export UV_PYTHON_DOWNLOADS ?= never
 .PHONY: demo test check lock uv clean
 
 demo: $(STAMP)
-	$(BIN)/torchdyn-plan evaluate --static ik --planners pursuit corner oracle --velocity 3 --episodes 100 --seed 0 --out runs/demo
+	$(BIN)/torchdyn-plan evaluate --static ik --planners pursuit corner oracle meet --velocity 3 --episodes 100 --seed 0 --out runs/demo
 
 # One thread a worker: two pools of threads on the same cores slow each other down.
 test: $(STAMP)

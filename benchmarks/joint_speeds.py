@@ -8,9 +8,10 @@ from pathlib import Path
 
 import torch
 import tyro
+from torch import Tensor
 from tqdm import tqdm
 
-from torchdyn_plan.envs import TrapperEnv
+from torchdyn_plan.envs import TrapperEnv, TrapperScene, TrapperSimulation
 from torchdyn_plan.evaluation.run import PLANNERS
 from torchdyn_plan.files import write_json
 from torchdyn_plan.kinematics import UR5_LINKS, UR5_SPEED_LIMIT
@@ -36,29 +37,46 @@ class Arguments:
     """JSON file for the figures."""
 
 
+class TouchedSimulation(TrapperSimulation):
+    """A simulation that tells which arms a contact has pushed in any physics step of the last control step."""
+
+    def __init__(self, num_envs: int, scene: TrapperScene) -> None:
+        """Build the simulation as `TrapperSimulation` does."""
+        super().__init__(num_envs, scene)
+        self._first = int(self.model.joint(UR5_LINKS[0].joint).dofadr[0])
+        self.touched = torch.zeros(num_envs, dtype=torch.bool)
+
+    def step(self, action: Tensor | None = None, rows: Tensor | None = None) -> None:
+        """One control step, a physics step at a time."""
+        if action is not None:
+            self._drive(action)
+        self.touched = torch.zeros_like(self.touched)
+        for _ in range(self.substeps):
+            self.batch.step(None if rows is None else rows.numpy(), nstep=1)
+            force = torch.from_numpy(self.batch.bind("qfrc_constraint"))
+            self.touched |= (force[:, self._first : self._first + len(UR5_LINKS)] != 0).any(-1)
+
+
 @torch.no_grad()
 def main(arguments: Arguments) -> None:
     """Run, print and write."""
     torch.set_num_threads(1)
     env = TrapperEnv(arguments.num_envs, velocity=arguments.velocity, split="test")
     planner = PLANNERS[arguments.planner]("ik")
-    simulation, joints = env.simulation, len(UR5_LINKS)
-    first = int(simulation.model.joint(UR5_LINKS[0].joint).dofadr[0])
-    force = torch.from_numpy(simulation.batch.bind("qfrc_constraint").copy())
+    env.simulation = simulation = TouchedSimulation(arguments.num_envs, env.scene)
+    joints = len(UR5_LINKS)
     fastest, steps, above = torch.zeros(joints, dtype=torch.float64), 0, 0
     since = torch.full((arguments.num_envs,), AFTERMATH)
     state = env.reset()
     with tqdm(total=arguments.episodes, unit="episode") as bar:
         while bar.n < arguments.episodes:
             stepped, state = env.step_and_maybe_reset(planner(state))
-            force.copy_(torch.from_numpy(simulation.batch.bind("qfrc_constraint").copy()))
-            touched = (force[:, first : first + joints] != 0).any(-1)
-            since = torch.where(touched, 0, since + 1)
+            since = torch.where(simulation.touched, 0, since + 1)
             free = since > AFTERMATH
             share = stepped["next", "joint_vel"][free].double().abs() / UR5_SPEED_LIMIT
             if len(share):
                 fastest = torch.maximum(fastest, share.amax(0))
-                above += int((share > 1.02).any(-1).sum())
+                above += int(share.gt(1.02).any(dim=-1).sum())
             steps += len(share)
             bar.update(int(stepped["next", "done"].sum()))
     for link, value in zip(UR5_LINKS, fastest.tolist(), strict=True):

@@ -164,11 +164,10 @@ class TrapperEnv(EnvBase):
         tensordict.set("next", after)
         entries = dict(tensordict.items()) | dict(after.items())
         del entries["next"], entries["reward"]
-        onward = TensorDict(entries, batch_size=self.batch_size, device=self.device)
-        done = after["done"]
+        done = entries["done"]
         if done.any():
-            onward.update(self._reset(TensorDict({"_reset": done}, batch_size=self.batch_size)))
-        return tensordict, onward
+            entries |= dict(self._reset(TensorDict({"_reset": done}, batch_size=self.batch_size)).items())
+        return tensordict, TensorDict(entries, batch_size=self.batch_size, device=self.device)
 
     def _tool(self, joint_pos: Tensor) -> tuple[Tensor, Tensor]:
         """Place (N, 3) [m, world] and rotation (N, 3, 3) of the box mouth at joint angles (N, 6) [rad]."""
