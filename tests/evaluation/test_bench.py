@@ -68,8 +68,8 @@ def test_a_replan_is_measured_in_its_parts_and_a_batch_equals_its_rows(planner):
     rows = bench_replan.bench(planner, batches=(1, 5), seconds=0.0)
     names = [row["what"] for row in rows if row["batch"] == 5 and row["device"] == "cpu"]
     assert names == [
-        "re-plan", "forecaster", "ETA, 1 goal", "ETA, 4 goals", "search alone", "IK path of 5 steps",
-        "planner step that plans", "planner step between plans",
+        "re-plan", "re-plan, exact search", "forecaster", "ETA, 1 goal", "ETA, 4 goals", "search alone",
+        "IK path of 5 steps", "planner step that plans", "planner step between plans",
     ]  # fmt: skip
     for row in rows:
         assert row.keys() >= COLUMNS

@@ -16,7 +16,7 @@ from torchdyn_plan.evaluation.run import one_thread
 from torchdyn_plan.evaluation.timing import figures, sample
 from torchdyn_plan.nets import ETANetwork, Forecaster
 from torchdyn_plan.nets.eta import Arrival
-from torchdyn_plan.planners import DynamicPlanner, IKPlanner
+from torchdyn_plan.planners import DynamicPlanner, ExactSearch, IKPlanner
 
 BATCHES = (1, 64, 1024, 10000)
 """Rows that plan at once."""
@@ -105,19 +105,23 @@ def _parts(planner: DynamicPlanner) -> dict[str, Part]:
     def replan(seen: TensorDictBase) -> tuple[Tensor, ...]:
         return planner.plan(seen[keys.ROBOT_STATE], seen[keys.TARGET_POS], seen[keys.TARGET_HISTORY])[:2]
 
+    def replan_exactly(seen: TensorDictBase) -> tuple[Tensor, ...]:
+        arrival = partial(eta.arrival, seen[keys.ROBOT_STATE].unsqueeze(-2))
+        return ExactSearch()(forecaster(seen[keys.TARGET_HISTORY]), seen[keys.TARGET_POS], arrival)[:2]
+
     def arrivals(seen: TensorDictBase, goals: int) -> tuple[Tensor, ...]:
         state, goal = seen[keys.ROBOT_STATE].unsqueeze(1), seen[keys.TARGET_POS].unsqueeze(1)
         return (eta(state, goal.expand(-1, goals, 3)),)
 
     def search(seen: TensorDictBase) -> tuple[Tensor, ...]:
         here = seen[keys.TARGET_POS]
-        forecast = here.unsqueeze(1) + seen[keys.TARGET_HISTORY].diff(dim=1)[:, -1:] * forecaster.steps_ahead.unsqueeze(
-            -1
-        )
+        newest = seen[keys.TARGET_HISTORY].diff(dim=1)[:, -1:]
+        forecast = here.unsqueeze(1) + newest * forecaster.steps_ahead.unsqueeze(-1)
         return planner.search(forecast, here, _constant_arrival)[:2]
 
     return {
         "re-plan": replan,
+        "re-plan, exact search": replan_exactly,
         "forecaster": lambda seen: (forecaster(seen[keys.TARGET_HISTORY]),),
         "ETA, 1 goal": partial(arrivals, goals=1),
         "ETA, 4 goals": partial(arrivals, goals=4),

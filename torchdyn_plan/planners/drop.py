@@ -65,7 +65,8 @@ class Drop:
 
         Positive where the target is inside the box all the while that the rim is below its top: by the least gap to
         the near walls, or by half of what the rim is below the catch height when the target meets a far wall.
-        The later a drop, the more it is lowered, by ``hurry`` a step, so that the greatest entry says when to begin.
+        A drop that does not bring the rim so far down within ``steps`` encloses nothing. The later a drop, the more
+        its entry is lowered, by ``hurry`` a step, so that the greatest says when to begin.
 
         Args:
             path: ``(*B, outlook, 3)`` positions of the target from now on [m, world].
@@ -73,10 +74,12 @@ class Drop:
             tool_step: ``(*B, 3)``, how far the tool moved in the last step [m].
         """
         time = torch.arange(self.outlook, device=path.device, dtype=path.dtype)
-        gliding = self.glide * (1.0 - torch.exp(-time / self.glide))
+        gliding = self.glide * (1.0 - torch.exp(-time / max(self.glide, 1e-9)))
         offset = path[..., :2] - tool_pos[..., None, :2] - tool_step[..., None, :2] * gliding.unsqueeze(-1)
         window = offset.unfold(-2, self.steps + 1, 1)[..., : self.choices, :, :].mT
-        along = window * torch.sign(window[..., -1:, :] - window[..., :1, :])
+        heading = torch.sign(window[..., -1:, :] - window[..., :1, :])
+        # The wall behind a target that rests is the nearest one.
+        along = torch.where(heading == 0.0, -window.abs(), window * heading)
 
         rim = self.descent(tool_pos[..., 2], tool_step[..., 2]).unsqueeze(-2)
         above = (rim - self.radius).clamp(0.0, self.radius)
@@ -86,7 +89,7 @@ class Drop:
         near = (along.amin(-1) + self.half_width - reach).masked_fill(~low, 1.0)
         stopped = along.amax(-1) > self.half_width - reach
         met = stopped.cumsum(-1)
-        near = near.masked_fill(met > 0, 1.0).amin(-1)
+        near = near.masked_fill(met > 0, 1.0).amin(-1).masked_fill(~low.any(-1), -1.0)
         caught_at = torch.where(stopped & (met == 1), rim, 0.0).amax(-1)
         far = torch.where(met[..., -1] > 0, 0.5 * (self.catch_height - caught_at), 1.0)
         later = self.hurry * torch.arange(self.choices, device=path.device)

@@ -72,13 +72,7 @@ class DynamicPlanner(TensorDictModuleBase):
             InputError: a key is missing, a shape is wrong, the history holds a NaN, or data and networks are on
                 different devices.
         """
-        get = partial(read, tensordict, reader="DynamicPlanner")
-        tool_pos, target_pos, robot_state = get(keys.TOOL_POS), get(keys.TARGET_POS), get(keys.ROBOT_STATE)
-        seen = [get(key) for key in self.seen_keys]
-        if not torch.compiler.is_compiling():
-            self._check(tool_pos, target_pos, dict(zip(self.seen_keys, seen, strict=True)))
-        step_count = get(keys.STEP_COUNT).reshape(tool_pos.shape[:-1])
-
+        tool_pos, target_pos, robot_state, step_count, *seen = self._read(tensordict)
         memory = recall(tensordict)
         clock, due = self.schedule.tick(None if memory is None else memory.clock, step_count)
         meeting = carry_on(memory, tool_pos, step_count)
@@ -91,6 +85,15 @@ class DynamicPlanner(TensorDictModuleBase):
         forecast = self.forecaster(*seen)
         eta = partial(self.eta.arrival, robot_state.unsqueeze(-2))
         return self.search(forecast, target_pos, eta)
+
+    def _read(self, tensordict: TensorDictBase) -> list[Tensor]:
+        """Tool and target (*B, 3) [m, world], robot state (*B, S), step count (*B,), and what the forecaster reads."""
+        get = partial(read, tensordict, reader=self._get_name())
+        tool_pos, target_pos, robot_state = get(keys.TOOL_POS), get(keys.TARGET_POS), get(keys.ROBOT_STATE)
+        seen = [get(key) for key in self.seen_keys]
+        if not torch.compiler.is_compiling():
+            self._check(tool_pos, target_pos, dict(zip(self.seen_keys, seen, strict=True)))
+        return [tool_pos, target_pos, robot_state, get(keys.STEP_COUNT).reshape(tool_pos.shape[:-1]), *seen]
 
     def _check(self, tool_pos: Tensor, target_pos: Tensor, seen: dict[str, Tensor]) -> None:
         check_trailing_shape(keys.TOOL_POS, tool_pos, 3)

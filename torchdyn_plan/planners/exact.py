@@ -54,6 +54,10 @@ class ExactSearch:
         check_number("longest_stay", self.longest_stay, minimum=1, integer=True)
         for name in ("lead", "margin", "footprint", "patience", "loyalty", "arrived"):
             check_number(name, getattr(self, name), minimum=0.0)
+        if self.half_extent is not None:
+            check_number("half_extent", self.half_extent, minimum=0.0)
+        if self.height is not None:
+            check_number("height", self.height)
 
     def __call__(
         self,
@@ -77,11 +81,15 @@ class ExactSearch:
             The meeting; ``arrival_steps`` is when the target comes within the footprint.
 
         Raises:
-            InputError: ``target_pos`` or ``forecast`` has another shape, or their batches differ.
+            InputError: an argument has another shape, or their batches differ.
         """
         check_trailing_shape("target_pos", target_pos, 3)
         horizon = forecast.shape[-2] if forecast.ndim > 1 else 1
         check_trailing_shape("forecast", forecast, *target_pos.shape[:-1], horizon, 3)
+        if tool_pos is not None:
+            check_trailing_shape("tool_pos", tool_pos, *target_pos.shape)
+        if planned_steps is not None:
+            check_trailing_shape("planned_steps", planned_steps, *target_pos.shape[:-1])
         path = torch.cat([target_pos.unsqueeze(-2), forecast], dim=-2)
         steps = torch.arange(min(2, horizon), horizon + 1, self.stride, device=path.device)
         goals = self.goals(path[..., steps, :])
@@ -102,7 +110,8 @@ class ExactSearch:
         on_table = path[..., steps, 2] > 0.0
         in_time = (slack >= 0.0) & (stay > 0) & on_table
         nothing = ~in_time.any(dim=-1, keepdim=True)
-        late = slack.clamp(min=-1e6) + torch.where(on_table & (stay > 0), 0.0, -1e4)
+        # Worse and worse: late, out of the box's reach, never reached by the robot, below the table.
+        late = slack.clamp(min=-1e6) - 1e4 * (stay == 0) - 1e7 * ~on_table
         score = torch.where(nothing, late, score.masked_fill(~in_time, -torch.inf))
         best = score.argmax(dim=-1, keepdim=True)
         return SearchResult(
@@ -131,15 +140,16 @@ class ExactSearch:
 
         Returns:
             Both ``(*B, K)`` int64, in control steps; the stay is 0 where the target never comes within the footprint.
+            The past does not count; after the forecast's end the target rests where it is.
         """
         if self.footprint == 0.0:
             one = torch.ones(goals.shape[:-1], dtype=torch.int64, device=goals.device)
             return torch.zeros_like(one), one
         around = torch.arange(-self.longest_stay, self.longest_stay + 1, device=steps.device)
-        index = (steps.unsqueeze(-1) + around).clamp(0, path.shape[-2] - 1)
-        near = path[..., index, :]
+        index = steps.unsqueeze(-1) + around
+        near = path[..., index.clamp(0, path.shape[-2] - 1), :]
         away = (near[..., :2] - goals[..., :2].unsqueeze(-2)).abs().amax(-1)
-        there = (away <= self.footprint) & (near[..., 2] > 0.0)
+        there = (away <= self.footprint) & (near[..., 2] > 0.0) & (index >= 0)
         after = there[..., self.longest_stay :].long().cumprod(-1).sum(-1)
         before = there[..., : self.longest_stay + 1].flip(-1).long().cumprod(-1).sum(-1)
         stay = (before + after - 1).clamp(0, self.longest_stay)

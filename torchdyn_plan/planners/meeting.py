@@ -16,7 +16,7 @@ from torchdyn_plan.planners.drop import Drop
 from torchdyn_plan.planners.dynamic import DynamicPlanner
 from torchdyn_plan.planners.exact import ExactSearch
 from torchdyn_plan.planners.memory import carry_on, recall, remember
-from torchdyn_plan.planners.protocol import ArrivalPredictor, StaticPlanner, read
+from torchdyn_plan.planners.protocol import ArrivalPredictor, StaticPlanner
 from torchdyn_plan.planners.rows import apply_to_rows
 from torchdyn_plan.planners.schedule import ReplanSchedule
 from torchdyn_plan.planners.search import SearchResult
@@ -35,7 +35,7 @@ class MeetingPlanner(DynamicPlanner):
     History → forecast → meeting (`ExactSearch`, with goals above the table) → ``goal``: above the meeting place until
     `Drop` finds that now is the time, then down over the target, following it; and up to the next meeting if it was
     missed. The static planner hears of all that through the goal alone. It re-plans often, every 4 steps by default.
-    Rows whose forecast holds a NaN or an infinity stay where they are and are not `reachable`.
+    Rows whose forecast holds a NaN or an infinity stay where they are, take the target to rest and are not `reachable`.
     """
 
     def __init__(
@@ -69,22 +69,16 @@ class MeetingPlanner(DynamicPlanner):
         schedule = schedule or ReplanSchedule(window=4, shrink=1.0, minimum=4)
         super().__init__(static, forecaster, eta, search=search or WAITING, schedule=schedule, chunk=chunk)
         self.search: ExactSearch
-        check_number("lead", lead, minimum=0, integer=True)
+        self.drop, self.table_height, self.pull, self.lead = drop or Drop(), table_height, pull, lead
+        check_number("lead", lead, minimum=0, maximum=self.drop.outlook - 1, integer=True)
         for name, value in (("table_height", table_height), ("pull", pull)):
             check_number(name, value, minimum=0.0)
-        self.drop, self.table_height, self.pull, self.lead = drop or Drop(), table_height, pull, lead
         written: list[Any] = list(self.out_keys)
         self.out_keys = written + [(keys.PLAN, name) for name in DROP_NAMES]
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         """Plan where a plan is due, wait or drop, and act; raises what `DynamicPlanner.forward` raises."""
-        get = partial(read, tensordict, reader="MeetingPlanner")
-        tool_pos, target_pos, robot_state = get(keys.TOOL_POS), get(keys.TARGET_POS), get(keys.ROBOT_STATE)
-        seen = [get(key) for key in self.seen_keys]
-        if not torch.compiler.is_compiling():
-            self._check(tool_pos, target_pos, dict(zip(self.seen_keys, seen, strict=True)))
-        step_count = get(keys.STEP_COUNT).reshape(tool_pos.shape[:-1])
-
+        tool_pos, target_pos, robot_state, step_count, *seen = self._read(tensordict)
         memory = recall(tensordict)
         clock, due = self.schedule.tick(None if memory is None else memory.clock, step_count)
         meeting = carry_on(memory, tool_pos, step_count)
@@ -124,10 +118,11 @@ class MeetingPlanner(DynamicPlanner):
         eta = partial(self.eta.arrival, robot_state.unsqueeze(-2))
         found = self.search(known, target_pos, eta, tool_pos=tool_pos, planned_steps=planned_steps)
         goal = torch.where(usable.unsqueeze(-1), found.goal, tool_pos)
-        outlook = torch.cat([target_pos.unsqueeze(-2), known], dim=-2)[..., : self._outlook, :]
+        path = torch.cat([target_pos.unsqueeze(-2), known], dim=-2)
+        ahead = torch.arange(self._outlook, device=path.device).clamp(max=path.shape[-2] - 1)
         return (
             goal, found.arrival_steps, found.clamped, found.reachable & usable,
-            outlook, torch.zeros_like(found.arrival_steps),
+            path[..., ahead, :], torch.zeros_like(found.arrival_steps),
         )  # fmt: skip
 
     @property
@@ -148,7 +143,7 @@ class MeetingPlanner(DynamicPlanner):
         fresh = step_count == 0
         old = map(plan.get, DROP_NAMES)
         return tuple(
-            torch.where(fresh.reshape(*fresh.shape, *[1] * (new.dim() - fresh.dim())), new, value)
+            torch.where(fresh[(..., *[None] * (new.ndim - fresh.ndim))], new, value)
             for new, value in zip(start, old, strict=True)
         )
 

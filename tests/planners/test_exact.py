@@ -1,0 +1,207 @@
+import pytest
+import torch
+
+from tests.planners.toy import Arrival
+from torchdyn_plan.errors import InputError
+from torchdyn_plan.planners import ExactSearch
+
+HEIGHT = 0.04
+
+
+def robot(tool=(0.0, 0.0, HEIGHT), speed=0.01, reach=1.0):
+    """A perfect arrival predictor, distance / speed, of a tool that stays within ``reach``; keeps the questions."""
+    asked = []
+
+    def eta(goals, *, reading):
+        asked.append((tuple(goals.shape), reading))
+        return Arrival((goals - goals.new_tensor(tool)).norm(dim=-1) / speed, goals.norm(dim=-1) > reach)
+
+    return eta, asked
+
+
+def line(start, velocity, horizon=200, dtype=torch.float32):
+    """Forecast (horizon, 3) and present place of a target that goes straight on the table."""
+    here = torch.tensor([*start, HEIGHT], dtype=dtype)
+    ahead = torch.arange(1, horizon + 1, dtype=dtype)[:, None]
+    return here + ahead * torch.tensor([*velocity, 0.0], dtype=dtype), here
+
+
+def paths(*batch, horizon=90, dtype=torch.float32, seed=0):
+    """Curved paths, some of which end in a pocket."""
+    generator = torch.Generator().manual_seed(seed)
+    path = 0.02 * torch.randn(*batch, horizon + 1, 3, generator=generator, dtype=dtype).cumsum(-2)
+    path[..., 2] = path[..., 2] - path[..., 2].amin(-1, keepdim=True) - 0.02
+    return path[..., 1:, :], path[..., 0, :]
+
+
+FULL = ExactSearch(
+    stride=3, height=0.1, half_extent=0.3, lead=2.0, margin=4.0, footprint=0.04, longest_stay=7, loyalty=3.0,
+    arrived=0.05,
+)  # fmt: skip
+
+
+@pytest.mark.parametrize(
+    ("start", "velocity"), [((0.9, 0.0), (-0.005, 0)), ((0.3, -0.5), (0, 0.006)), ((0.103, 0), (0, 0))]
+)
+@pytest.mark.parametrize("stride", [1, 5])
+def test_the_first_meeting_is_found_within_the_stride_by_one_question(start, velocity, stride):
+    forecast, here = line(start, velocity)
+    eta, asked = robot()
+    result = ExactSearch(stride=stride)(forecast, here, eta)
+    first = next(
+        t for t in range(1, 201) if float(forecast[t - 1].sub(torch.tensor([0, 0, HEIGHT])).norm()) <= 0.01 * t
+    )
+    steps = int(result.arrival_steps)
+    assert first <= steps < first + stride
+    assert torch.equal(result.goal, forecast[steps - 1])
+    assert bool(result.reachable)
+    assert asked == [((len(range(2, 201, stride)), 3), "expectation")]
+
+
+@pytest.mark.parametrize("settings", [{"lead": 10.0}, {"margin": 10.0}, {"lead": 4.0, "margin": 6.0}])
+def test_lead_and_margin_are_kept(settings):
+    # From 0.9 at 0.005 a step to meet a tool of 0.01 a step: 0.9 - 0.005 t = 0.01 (t - 10), t = 66.7.
+    forecast, here = line((0.9, 0.0), (-0.005, 0.0))
+    assert int(ExactSearch(stride=1, **settings)(forecast, here, robot()[0]).arrival_steps) == 67
+
+
+def test_out_of_reach_the_least_late_place_is_a_direction():
+    forecast, here = line((0.2, 0.0), (0.02, 0.0), horizon=40)
+    result = ExactSearch(stride=1)(forecast, here, robot()[0])
+    assert not bool(result.reachable)
+    assert int(result.arrival_steps) == 2
+    nowhere = ExactSearch(stride=1)(forecast, here, robot(reach=0.0)[0])
+    assert not bool(nowhere.reachable)
+    assert torch.isfinite(nowhere.goal).all()
+
+
+@pytest.mark.parametrize("search", [ExactSearch(stride=1), ExactSearch(stride=1, footprint=0.05, patience=0.0)])
+@pytest.mark.parametrize("reach", [1.0, 0.0])
+def test_a_pocketed_target_is_never_chosen(search, reach):
+    forecast, here = line((0.4, 0.0), (-0.003, 0.0))
+    forecast[20:, 2] = -0.1
+    result = search(forecast, here, robot(reach=reach)[0])
+    assert not bool(result.reachable)
+    assert result.goal[2] > 0.0
+    # The robot could be in time only where the ball lies in the pocket, and could get nowhere else at all.
+    only_below = search(forecast, here, lambda goals, reading: Arrival(goals[..., 0] * 0.0, goals[..., 2] > 0.0))
+    assert not bool(only_below.reachable)
+    assert only_below.goal[2] > 0.0
+
+
+def test_the_longest_stay_wins_without_patience_and_the_earliest_with_it():
+    # At 0.02 a step, and half as fast from step 30 on: there it stays twice as long.
+    speed = torch.where(torch.arange(1, 101) < 30, 0.02, 0.01)
+    forecast = torch.zeros(100, 3)
+    forecast[:, 0], forecast[:, 2] = speed.cumsum(0) - 0.4, HEIGHT
+    here = torch.tensor([-0.4, 0.0, HEIGHT])
+    settings = {"stride": 1, "footprint": 0.045, "longest_stay": 9}
+    patient = ExactSearch(patience=0.0, **settings)(forecast, here, robot(speed=0.1)[0])
+    hasty = ExactSearch(patience=9.0, **settings)(forecast, here, robot(speed=0.1)[0])
+    # Nine places of 0.01 a step lie within 0.045 of each: the first such place is that of step 33, entered at 29.
+    assert int(patient.arrival_steps) == 29
+    assert patient.goal[0].item() == pytest.approx(forecast[32, 0].item())
+    assert int(hasty.arrival_steps) < 8
+
+
+def test_the_first_of_equal_candidates_wins():
+    forecast, here = line((0.1, 0.0), (0.0, 0.0), horizon=60)
+    assert int(ExactSearch(patience=0.0)(forecast, here, robot()[0]).arrival_steps) == 12
+
+
+def test_loyalty_keeps_a_planned_meeting_and_forgives_its_margin():
+    forecast, here = line((0.9, 0.0), (-0.005, 0.0))
+    eta = robot()[0]
+    planned = torch.tensor(120)
+    loyal = ExactSearch(loyalty=8.0, margin=10.0)
+    assert abs(int(loyal(forecast, here, eta, planned_steps=planned).arrival_steps) - 120) <= 6
+    assert int(loyal(forecast, here, eta).arrival_steps) == 67
+    assert int(ExactSearch(margin=10.0)(forecast, here, eta, planned_steps=planned).arrival_steps) == 67
+    # Planned for 62: too near for the margin, yet in time; the robot may not fall behind e(t) = t.
+    assert int(loyal(forecast, here, eta, planned_steps=torch.tensor(64)).arrival_steps) == 62
+    assert int(loyal(forecast, here, eta, planned_steps=torch.tensor(40)).arrival_steps) == 67
+
+
+def test_a_goal_beneath_the_tool_is_reached_now_whatever_the_predictor_says():
+    forecast, here = line((0.1, 0.0), (0.0, 0.0))
+    never = robot(reach=0.0)[0]
+    search = ExactSearch(height=0.2, arrived=0.015)
+    result = search(forecast, here, never, tool_pos=torch.tensor([0.11, 0.005, 0.5]))
+    assert bool(result.reachable)
+    assert int(result.arrival_steps) == 2
+    assert not bool(search(forecast, here, never, tool_pos=torch.tensor([0.12, 0.0, 0.2])).reachable)
+
+
+def test_goals_are_clamped_and_lifted():
+    forecast, here = line((0.5, -0.6), (0.0, 0.0))
+    result = ExactSearch(half_extent=0.4, height=0.1)(forecast, here, robot()[0])
+    assert result.goal.tolist() == pytest.approx([0.4, -0.4, 0.1])
+    # A target that rests 0.2 away from all places of the box is in time for none.
+    assert not bool(ExactSearch(half_extent=0.4, footprint=0.1)(forecast, here, robot()[0]).reachable)
+
+
+def test_stays_agree_with_counting():
+    forecast, here = paths(6, seed=2)
+    path = torch.cat([here.unsqueeze(-2), forecast], dim=-2)
+    steps = torch.arange(2, 91, 3)
+    places = FULL.goals(path[:, steps])
+    before, stay = FULL.stays(path, places, steps)
+    assert len(stay.unique()) == 8
+    for row, k in [(row, k) for row in range(6) for k in range(len(steps))]:
+        there = [bool((p[:2] - places[row, k, :2]).abs().max() <= 0.04 and p[2] > 0) for p in path[row]]
+        there += [there[-1]] * 10
+        t = first = int(steps[k])
+        while there[t] and first > 0 and there[first - 1] and t - first < 7:
+            first -= 1
+        last = t
+        while there[t] and there[last + 1] and last - t < 7:
+            last += 1
+        assert int(before[row, k]) == t - first
+        assert int(stay[row, k]) == (min(7, last - first + 1) if there[t] else 0)
+
+
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+@pytest.mark.parametrize("batch", [(), (1,), (3, 4)])
+@pytest.mark.parametrize("search", [ExactSearch(), FULL])
+def test_a_batch_is_a_loop_over_its_rows_in_any_order(search, batch, dtype):
+    forecast, here = paths(*batch, dtype=dtype)
+    tool, planned = torch.roll(here, 1, -1) / 4, (here[..., 0].abs() * 500).long()
+    result = search(forecast, here, robot()[0], tool_pos=tool, planned_steps=planned)
+    assert result.goal.dtype == dtype
+    assert [x.shape for x in result] == [(*batch, 3), batch, batch, batch]
+    flat = forecast.reshape(-1, 90, 3), here.reshape(-1, 3), tool.reshape(-1, 3), planned.reshape(-1)
+    for row in reversed(range(len(flat[0]))):
+        f, p, t, s = (value[row] for value in flat)
+        alone = search(f, p, robot()[0], tool_pos=t, planned_steps=s)
+        for whole, single in zip(result, alone, strict=True):
+            assert torch.equal(whole.reshape(-1, *single.shape)[row], single)
+
+
+@pytest.mark.parametrize("mirror", [(-1, 1, 1), (1, -1, 1), (-1, -1, 1)])
+def test_a_mirrored_scene_has_mirrored_goals(mirror):
+    forecast, here = paths(40)
+    mirror = torch.tensor(mirror, dtype=here.dtype)
+    one, other = (FULL(forecast * m, here * m, robot()[0]) for m in (torch.ones(3), mirror))
+    assert torch.equal(one.goal * mirror, other.goal)
+    assert torch.equal(one.arrival_steps, other.arrival_steps)
+    assert one.reachable.any()
+
+
+SHAPES = [((5, 2), (3,), {}), ((5, 3), (2,), {}), ((3,), (3,), {}), ((2, 5, 3), (4, 3), {})]
+SHAPES += [((2, 5, 3), (2, 3), {"tool_pos": torch.zeros(3)}), ((2, 5, 3), (2, 3), {"planned_steps": torch.zeros(2, 1)})]
+
+
+@pytest.mark.parametrize(("forecast", "here", "more"), SHAPES)
+def test_wrong_shapes_are_named(forecast, here, more):
+    with pytest.raises(InputError, match=next(iter(more), "") + r".*must have shape"):
+        ExactSearch()(torch.zeros(forecast), torch.zeros(here), robot()[0], **more)
+
+
+BAD = [("stride", 0), ("stride", 2.5), ("longest_stay", 0), ("half_extent", -1.0), ("height", float("nan"))]
+BAD += [(name, -0.5) for name in ("lead", "margin", "footprint", "patience", "loyalty", "arrived")]
+
+
+@pytest.mark.parametrize(("name", "value"), BAD)
+def test_a_bad_setting_is_named(name, value):
+    with pytest.raises(InputError, match=f"{name}.*{value}"):
+        ExactSearch(**{name: value})
