@@ -35,8 +35,8 @@ class SearchResult(NamedTuple):
 class CornerSearch:
     """The paper's search: the corners of a square around the target, in two passes of the arrival predictor."""
 
-    reading: Literal["mode", "expectation"] = "expectation"
-    """How the predicted distribution of arrival times is read; the paper takes the likeliest bin, its ``mode``."""
+    reading: Literal["mode", "expectation"] = "mode"
+    """How the predicted distribution of arrival times is read: the likeliest bin, as in the paper, or its mean."""
 
     def __post_init__(self) -> None:
         check_choice("reading", self.reading, ("mode", "expectation"))
