@@ -6,19 +6,24 @@ arm. What is still lost with both true is lost by the search and by the static p
     python benchmarks/diagnose.py --out benchmarks/results/diagnose.json
 """
 
-from dataclasses import asdict, dataclass, replace
+import time
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
 import torch
 import tyro
+from torch import Tensor
+from tqdm import trange
 
+from torchdyn_plan import keys
 from torchdyn_plan.cli_arguments import EvaluateArguments
 from torchdyn_plan.envs.scene import TrapperScene
+from torchdyn_plan.envs.trapper import MAX_STEPS, TrapperEnv
 from torchdyn_plan.evaluation.measured import MeasuredArrival
 from torchdyn_plan.evaluation.paper import paper_rate
-from torchdyn_plan.evaluation.results import summarize
-from torchdyn_plan.evaluation.run import IK_CHUNK, record_truth, run_episodes
+from torchdyn_plan.evaluation.results import EpisodeOutcomes, summarize
+from torchdyn_plan.evaluation.run import IK_CHUNK, EpisodeLog, record_truth
 from torchdyn_plan.files import write_json
 from torchdyn_plan.planners import CornerSearch, DynamicPlanner, IKPlanner
 from torchdyn_plan.planners.baselines import RecordedFuture
@@ -31,7 +36,7 @@ class Arguments:
 
     velocities: tuple[float, ...] = (1.0, 2.0, 3.0, 4.0, 5.0)
     """[m/s]"""
-    episodes: int = 256
+    episodes: int = 128
     """Episodes a point, all side by side, so that they re-plan together."""
     split: str = "test"
     """Series of episodes: test, or dev while tuning."""
@@ -57,6 +62,24 @@ def planners() -> dict[str, DynamicPlanner]:
     }
 
 
+@torch.no_grad()
+def run_together(
+    planner: DynamicPlanner, setting: EvaluateArguments, future: Tensor, solvable: Tensor
+) -> EpisodeOutcomes:
+    """Outcomes of all episodes side by side, none put back, so that all re-plan and are measured at the same steps."""
+    count, started = setting.episodes, time.perf_counter()
+    env = TrapperEnv(count, velocity=setting.velocity, split=setting.split, seed=setting.seed)
+    log, tensordict = EpisodeLog.empty(count), env.reset()
+    for _ in trange(MAX_STEPS, leave=False):
+        stepped = env.step(planner(tensordict.set(keys.TARGET_FUTURE, future)))
+        log.add(env.scene, stepped)
+        tensordict = env.step_mdp(stepped)
+    return EpisodeOutcomes(
+        trapped=log.trapped, steps=log.steps, replans=log.replans, touched=log.touched, pocketed=log.pocketed,
+        solvable=solvable, seconds=time.perf_counter() - started,
+    )  # fmt: skip
+
+
 def main(arguments: Arguments) -> None:
     """Run, print and write."""
     torch.set_num_threads(1)
@@ -68,7 +91,7 @@ def main(arguments: Arguments) -> None:
         )  # fmt: skip
         future, solvable = record_truth(setting)
         for name, planner in planners().items():
-            outcome = run_episodes(planner, replace(setting), future, solvable, name)
+            outcome = run_together(planner, setting, future, solvable)
             row = summarize(outcome, planner=name, static="ik", velocity=velocity, friction=0.0)
             paper = paper_rate("oracle" if "truth" in name else "corner", "ik", "velocity", velocity, solvable=True)
             print(

@@ -18,7 +18,7 @@ from torchdyn_plan.evaluation.run import PLANNERS, EpisodeLog, Planner, one_thre
 from torchdyn_plan.evaluation.timing import figures
 from torchdyn_plan.versions import usable_cores
 
-SIZES = (64, 256, 1024, 2048)
+SIZES = (64, 256, 2048)
 """Environments side by side."""
 VELOCITY = 3.0
 """Velocity of the balls at the start [m/s]."""

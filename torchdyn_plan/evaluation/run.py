@@ -162,12 +162,13 @@ class EpisodeLog:
         return cls(*flags, steps=torch.full((count,), -1), replans=torch.zeros(count, dtype=torch.int64))
 
     def add(self, scene: TrapperScene, stepped: TensorDict | TensorDictBase) -> int:
-        """Take in one step of all environments; returns how many episodes it ended."""
+        """Take in one step of all environments; returns how many episodes it ended. What comes later does not count."""
         after: TensorDictBase = stepped.get("next")
         episode = after[keys.EPISODE]
         touched = is_touched(scene, after[keys.TOOL_POS], after[keys.TARGET_POS])
         done = after["done"].squeeze(-1)
         ours = episode < len(self.done)
+        ours[ours.clone()] = ~self.done[episode[ours]]
         hit = episode[touched & ours]
         self.touched[hit] = True
         ended = done & ours
