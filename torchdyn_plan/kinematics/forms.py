@@ -23,36 +23,44 @@ class SineForm(nn.Module):
 
     _frequencies: Tensor
     _phases: Tensor
-    _weights: Tensor
-    _slopes: Tensor | None
+    _pose_weights: Tensor
+    _jacobian_weights: Tensor
+    _pose_slopes: Tensor | None
+    _jacobian_slopes: Tensor | None
 
     def __init__(self, form: TrigonometricForm) -> None:
-        """Lay the entries of ``form`` out as a pose ``(4, 4)`` and a Jacobian ``(6, N)``, one after the other."""
+        """Lay the entries of ``form`` out as a pose ``(4, 4)`` and a Jacobian ``(6, N)``.
+
+        Each has a product of its own: two small ones take less time than cutting the result of one.
+        """
         super().__init__()
         self.num_joints = len(form.frequencies)
-        constant = _laid_out(form.constant.unsqueeze(0), 1.0)
+        weights = torch.cat([_laid_out(form.constant.unsqueeze(0), 1.0), _laid_out(form.weights, 0.0)])
+        slopes = None if form.slopes is None else _laid_out(form.slopes, 0.0)
         _register(self, "_frequencies", torch.nn.functional.pad(form.frequencies, (1, 0)))
         _register(self, "_phases", torch.nn.functional.pad(form.phases, (1, 0), value=torch.pi / 2))
-        _register(self, "_weights", torch.cat([constant, _laid_out(form.weights, 0.0)]))
-        _register(self, "_slopes", None if form.slopes is None else _laid_out(form.slopes, 0.0))
+        for name, columns in {"pose": slice(16), "jacobian": slice(16, None)}.items():
+            _register(self, f"_{name}_weights", weights[:, columns].contiguous())
+            _register(self, f"_{name}_slopes", None if slopes is None else slopes[:, columns].contiguous())
 
     def forward(self, joint_pos: Tensor) -> Tensor:
         """Pose ``(B, 4, 4)`` alone, for ``(B, N)``."""
-        sines = torch.addmm(self._phases, joint_pos, self._frequencies).sin()
-        pose = torch.mm(sines, self._weights[:, :16])
-        if self._slopes is not None:
-            pose = torch.addmm(pose, joint_pos, self._slopes[:, :16])
+        # A module's attribute that is a buffer takes as long to look up as a small operation; its table does not.
+        own = cast(dict[str, Tensor], self._buffers)
+        sines = torch.addmm(own["_phases"], joint_pos, own["_frequencies"]).sin()
+        pose = torch.mm(sines, own["_pose_weights"])
+        if own["_pose_slopes"] is not None:
+            pose = torch.addmm(pose, joint_pos, own["_pose_slopes"])
         return pose.view(-1, 4, 4)
 
     def pose_and_jacobian(self, joint_pos: Tensor) -> tuple[Tensor, Tensor]:
         """Pose ``(B, 4, 4)`` and Jacobian ``(B, 6, N)``, for ``(B, N)``."""
-        # A module's attribute that is a buffer takes as long to look up as a small operation; its table does not.
         own = cast(dict[str, Tensor], self._buffers)
         sines = torch.addmm(own["_phases"], joint_pos, own["_frequencies"]).sin()
-        entries = torch.mm(sines, own["_weights"])
-        if own["_slopes"] is not None:
-            entries = torch.addmm(entries, joint_pos, own["_slopes"])
-        pose, jacobian = entries.split_with_sizes((16, 6 * self.num_joints), dim=-1)
+        pose, jacobian = torch.mm(sines, own["_pose_weights"]), torch.mm(sines, own["_jacobian_weights"])
+        if own["_pose_slopes"] is not None:
+            pose = torch.addmm(pose, joint_pos, own["_pose_slopes"])
+            jacobian = torch.addmm(jacobian, joint_pos, own["_jacobian_slopes"])
         return pose.view(-1, 4, 4), jacobian.view(-1, 6, self.num_joints)
 
 

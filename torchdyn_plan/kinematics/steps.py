@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from typing import cast
 
 import torch
 from torch import Tensor, nn
@@ -50,14 +51,18 @@ class DampedSteps(nn.Module):
         return q.reshape(joint_pos.shape)
 
     def _eager(self, q: Tensor, target: Tensor) -> Tensor:
+        own = cast(dict[str, Tensor], self._buffers)
         # The error is linear in the pose, by a matrix that is linear in the target.
-        to_error = torch.addmm(self._error, target, self._error_of_target).view(-1, 6, 16)
+        to_error = torch.addmm(own["_error"], target, own["_error_of_target"]).view(-1, 6, 16)
         for _ in range(self.steps):
             pose, jacobian = self.arm.form.pose_and_jacobian(q)
-            error = torch.bmm(to_error, pose.reshape(-1, 16, 1))
-            gram = torch.baddbmm(self._ridge, jacobian, jacobian.mT)
-            weights = torch.cholesky_solve(error, torch.linalg.cholesky_ex(gram)[0])
-            q = torch.baddbmm(q.unsqueeze(-1), jacobian.mT, weights).squeeze(-1)
+            error = torch.bmm(to_error, pose.view(-1, 16, 1))
+            transposed = jacobian.mT
+            factor, _ = torch.linalg.cholesky_ex(torch.baddbmm(own["_ridge"], jacobian, transposed))
+            # Two triangular solves take half the time of `cholesky_solve`.
+            half = torch.linalg.solve_triangular(factor, error, upper=False)
+            weights = torch.linalg.solve_triangular(factor.mT, half, upper=True)
+            q = torch.baddbmm(q.unsqueeze(-1), transposed, weights).squeeze(-1)
         return q
 
     def _columns(self, joint_pos: Columns, target: Columns) -> tuple[Vector]:
