@@ -121,7 +121,7 @@ def quick(monkeypatch):
 
 @pytest.mark.usefixtures("quick")
 def test_evaluate_prints_a_table_and_writes_everything(tmp_path, capsys):
-    words = ["evaluate", "--planners", "pursuit", "--velocity", 1.5, "--episodes", 8, "--num-envs", 5, "--threads", 1]
+    words = ["evaluate", "--planners", "pursuit", "--velocity", 0.5, "--episodes", 16, "--num-envs", 5, "--threads", 1]
     code, out, _ = answer([*words, "--split", "dev", "--out", tmp_path / "new" / "run"], capsys)
     assert code == 0
     assert "pursuit" in out
@@ -129,7 +129,7 @@ def test_evaluate_prints_a_table_and_writes_everything(tmp_path, capsys):
     assert sorted(path.name for path in folder.iterdir()) == ["episodes.json", "results.json", "results.png"]
     results = json.loads((folder / "results.json").read_text())
     assert set(results) == {"config", "versions", "machine", "rows"}
-    config = {"planners": ["pursuit"], "velocity": 1.5, "friction": 0.0, "episodes": 8, "seed": 0, "split": "dev"}
+    config = {"planners": ["pursuit"], "velocity": 0.5, "friction": 0.0, "episodes": 16, "seed": 0, "split": "dev"}
     assert config.items() <= results["config"].items()
     assert results["config"]["scene"] == TrapperScene().digest()
     (row,) = results["rows"]
@@ -141,7 +141,7 @@ def test_evaluate_prints_a_table_and_writes_everything(tmp_path, capsys):
     assert all(0 <= share <= 1 for share in row["failures"].values())
     assert sum(row["failures"].values()) + row["success"] == pytest.approx(1.0)
     episodes = json.loads((folder / "episodes.json").read_text())["pursuit"]
-    assert sum(episodes["trapped"]) == 8 * row["success"] > 0
+    assert sum(episodes["trapped"]) == 16 * row["success"] > 0
     assert (folder / "results.png").read_bytes().startswith(b"\x89PNG")
 
 

@@ -40,13 +40,15 @@ def slip(simulation):
     return simulation.ball_vel[:, :2] - RADIUS * torch.stack([y, -x], dim=-1)
 
 
-def test_a_ball_never_has_more_energy_than_it_started_with():
+@pytest.mark.parametrize("speed", [1.0, 5.0])
+def test_a_ball_never_has_more_energy_than_it_started_with(speed):
     random = torch.Generator().manual_seed(0)
-    place, velocity = torch.rand(2, 64, 2, generator=random, dtype=torch.float64) * 2 - 1
-    simulation = balls(place * (LINE - 0.005), 5 * velocity)
+    place = torch.rand(1024, 2, generator=random, dtype=torch.float64) * 2 - 1
+    angle = 2 * math.pi * torch.rand(1024, generator=random, dtype=torch.float64)
+    simulation = balls(place * (LINE - 0.005), speed * torch.stack([angle.cos(), angle.sin()], dim=-1))
     start = energy(simulation)
     least = start.clone()
-    for _ in range(500):
+    for _ in range(300):
         simulation.step()
         now = energy(simulation)
         # While a cushion or a pocket's edge is pressed in, it holds energy and gives it back: at most what was there.
@@ -55,7 +57,7 @@ def test_a_ball_never_has_more_energy_than_it_started_with():
         # The cloth is a spring too, in which a ball that lands from a cushion bounces: a thousandth of the start.
         assert (now <= least + 1e-3 * start)[free].all()
         least = torch.where(free, torch.minimum(least, now), least)
-    assert (least < start).all()
+    assert (now < start).all()
 
 
 def test_a_ball_slows_by_the_cloths_resistance_to_rolling_alone():
@@ -117,13 +119,27 @@ def first_contact(speed, angle):
     return before, after
 
 
+def returned_share(speed, step=1e-6):
+    """Speed after a frontal hit over that before, of the cushion's own equation solved in microseconds."""
+    share = []
+    for start in speed.tolist():
+        depth, rate = 0.0, start
+        while depth >= 0.0:
+            pressed = (0.1 + 0.89 * min(depth / SCENE.cushion_nose, 1.0)) / 0.99
+            force = pressed * (SCENE.cushion_damping * rate + pressed * SCENE.cushion_stiffness * depth)
+            rate -= step * max(force, 0.0)
+            depth += step * rate
+        share.append(-rate / start)
+    return torch.tensor(share, dtype=torch.float64)
+
+
 def test_a_cushion_returns_the_damped_springs_share_and_keeps_the_tangential_speed():
     speed = torch.tensor([0.5, 1.0, 2.0, 3.0, 4.0, 5.0], dtype=torch.float64)
-    before, after = first_contact(speed, torch.tensor([-0.9, 0.0, 0.5, 1.0], dtype=torch.float64))
-    ratio = SCENE.cushion_damping / (2 * math.sqrt(SCENE.cushion_stiffness))
-    expected = math.exp(-math.pi * ratio / math.sqrt(1 - ratio**2))
+    angle = torch.tensor([-0.9, 0.0, 0.5, 1.0], dtype=torch.float64)
+    before, after = first_contact(speed, angle)
     share = -after[:, 1] / before[:, 1]
-    torch.testing.assert_close(share, torch.full_like(share, expected), rtol=0.05, atol=0)
+    expected = returned_share((speed[:, None] * angle.cos()).reshape(-1))
+    torch.testing.assert_close(share, expected, rtol=0.05, atol=0)
     torch.testing.assert_close(after[:, 0], before[:, 0], rtol=0.05, atol=1e-3)
 
 

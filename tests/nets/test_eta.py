@@ -47,7 +47,7 @@ def test_statistics_standardise_the_inputs(network):
     state, goal = samples(500)
     state = state * 7 + 3
     network.set_input_statistics(state, goal)
-    seen = (state - network.state_offset) * network.state_scale
+    seen = network.state_shift + state * network.state_scale
     torch.testing.assert_close(seen.mean(0), torch.zeros(15, dtype=torch.float64), atol=1e-9, rtol=0)
     torch.testing.assert_close(seen.std(0), torch.ones(15, dtype=torch.float64))
 

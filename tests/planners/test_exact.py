@@ -145,11 +145,11 @@ def test_stays_agree_with_counting():
     path = torch.cat([here.unsqueeze(-2), forecast], dim=-2)
     steps = torch.arange(2, 91, 3)
     places = FULL.goals(path[:, steps])
-    before, stay = FULL.stays(path, places, steps)
+    before, stay = FULL.stays(path, places, 2)
     assert len(stay.unique()) == 8
     for row, k in [(row, k) for row in range(6) for k in range(len(steps))]:
         there = [bool((p[:2] - places[row, k, :2]).abs().max() <= 0.04 and p[2] > 0) for p in path[row]]
-        there += [there[-1]] * 10
+        there += [False] * 10
         t = first = int(steps[k])
         while there[t] and first > 0 and there[first - 1] and t - first < 7:
             first -= 1

@@ -30,7 +30,7 @@ class Sometimes(Straight):
 
 
 def make_planner(**settings):
-    settings = {"search": SEARCH, "drop": DROP, **settings}
+    settings = {"search": SEARCH, "drop": DROP, "lead": 3, "pull": 0.03, **settings}
     return MeetingPlanner(go_straight(), Sometimes(horizon=150), StraightArrival(), **settings)
 
 
@@ -112,10 +112,10 @@ def test_after_a_miss_it_goes_up_to_the_next_meeting():
     assert (landed["target_pos"] - landed["tool_pos"]).abs().max() < 0.02
 
 
-def test_plans_at_steps_13_17_21_and_stays_until_the_first():
+def test_plans_at_steps_13_18_23_and_stays_until_the_first():
     found = world(2).run(make_planner(), 40)
     due = [step for step, td in enumerate(found) if td["plan", "replanned"].all()]
-    assert due == list(range(13, 40, 4))
+    assert due == list(range(13, 40, 5))
     assert all(torch.equal(td["goal"], found[0]["tool_pos"]) for td in found[:13])
     planner = make_planner()
     world(2).run(planner, 40)

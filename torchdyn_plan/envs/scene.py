@@ -32,7 +32,7 @@ class TrapperScene:
     """[m]"""
     rail_height: float = 0.05
     """[m]"""
-    pocket_gap: float = 0.23
+    pocket_gap: float = 0.22
     """Free width of a pocket between two rail segments [m]."""
     pocket_offset: float = 0.42
     """Distance of a pocket's middle from the middle of its wall [m]."""
@@ -42,12 +42,14 @@ class TrapperScene:
     """[kg]"""
     rolling_resistance: float = 0.0001
     """Lever arm of the cloth's resistance to rolling [m]; deceleration is 5/7·g·lever/radius."""
-    cloth_friction: float = 0.065
+    cloth_friction: float = 0.05
     """Sliding friction coefficient of ball on cloth."""
     cushion_stiffness: float = 70000.0
-    """Stiffness of a cushion per effective mass [1/s²]."""
-    cushion_damping: float = 12.0
-    """Damping of a cushion per effective mass [1/s]."""
+    """Stiffness of a cushion per effective mass, once pressed in by `cushion_nose` [1/s²]."""
+    cushion_damping: float = 16.0
+    """Damping of a cushion per effective mass, once pressed in by `cushion_nose` [1/s]."""
+    cushion_nose: float = 0.02
+    """Depth over which a cushion stiffens from the soft first touch [m]."""
     box_half_width: float = 0.065
     """Inner half-width of the box [m]."""
     box_wall: float = 0.004
@@ -174,7 +176,9 @@ def _add_table(spec: mujoco.MjSpec, scene: TrapperScene) -> None:
             world.add_geom(
                 type=box, size=[*extent, scene.rail_height / 2 + 0.03],
                 pos=[*middle, scene.rail_height / 2 - 0.03], material="wood", condim=1, priority=3,
-                solref=[-scene.cushion_stiffness, -scene.cushion_damping], solimp=[0.99, 0.99, 0.001, 0.5, 2],
+                # Soft at first touch: a full spring at once, met between two steps, would give energy to a ball.
+                solref=[-scene.cushion_stiffness, -scene.cushion_damping],
+                solimp=[0.1, 0.99, scene.cushion_nose, 0.5, 1],
                 **fixed,
             )  # fmt: skip
         for side in (-1, 1):

@@ -12,7 +12,7 @@ from torchdyn_plan.checks import check_choice, check_same_device, check_trailing
 from torchdyn_plan.errors import InputError
 from torchdyn_plan.kinematics.components import ComponentForm
 from torchdyn_plan.kinematics.descriptions import joints_of_chain, joints_of_mjcf, joints_of_urdf
-from torchdyn_plan.kinematics.forms import FORMS
+from torchdyn_plan.kinematics.forms import FORMS, SineForm, TransformForm
 from torchdyn_plan.kinematics.joint import Joint, merge_fixed
 from torchdyn_plan.kinematics.ur5 import UR5_SPEED_LIMIT, ur5_urdf
 
@@ -128,7 +128,9 @@ class Arm(nn.Module):
         """
         self.check(joint_pos)
         if joint_pos.ndim == 2:
-            return self.form.pose_and_jacobian(joint_pos)
+            # A module's attribute that is a module takes as long to look up as a small operation.
+            form = cast(SineForm | TransformForm, self._modules["form"])
+            return form.pose_and_jacobian(joint_pos)
         batch = joint_pos.shape[:-1]
         pose, jacobian = self.form.pose_and_jacobian(joint_pos.reshape(-1, self.num_joints))
         return pose.view(*batch, 4, 4), jacobian.view(*batch, 6, self.num_joints)

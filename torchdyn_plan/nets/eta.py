@@ -1,6 +1,7 @@
 """When the robot can be somewhere: a classifier of arrival times, as a static planner would drive it there."""
 
 from dataclasses import dataclass
+from functools import lru_cache
 from typing import Any, NamedTuple
 
 import torch
@@ -32,7 +33,7 @@ class ETAConfig:
     """Bins of arrival time; one more class means *never arrives*."""
     bin_width: int = 5
     """Control steps in a bin."""
-    hidden: int = 256
+    hidden: int = 192
     """Width of the three hidden layers."""
 
     def __post_init__(self) -> None:
@@ -56,9 +57,9 @@ class ETANetwork(Pretrained, nn.Module):
 
     kind = "eta"
     config_type = ETAConfig
-    state_offset: Tensor
+    state_shift: Tensor
     state_scale: Tensor
-    goal_offset: Tensor
+    goal_shift: Tensor
     goal_scale: Tensor
 
     def __init__(self, config: ETAConfig | None = None, **settings: Any) -> None:
@@ -72,7 +73,7 @@ class ETANetwork(Pretrained, nn.Module):
         self.third = nn.Linear(hidden, hidden)
         self.head = nn.Linear(hidden, config.bins + 1)
         for name, width in (("state", size), ("goal", 8)):
-            self.register_buffer(f"{name}_offset", torch.zeros(width))
+            self.register_buffer(f"{name}_shift", torch.zeros(width))
             self.register_buffer(f"{name}_scale", torch.ones(width))
 
     @torch.no_grad()
@@ -80,8 +81,9 @@ class ETANetwork(Pretrained, nn.Module):
         """Standardise inputs by mean and deviation of the samples ``robot_state (n, S)`` and ``goal (n, 3)``."""
         features = self._goal_features(robot_state, goal)
         for name, values in (("state", robot_state), ("goal", features)):
-            getattr(self, f"{name}_offset").copy_(values.mean(dim=0))
-            getattr(self, f"{name}_scale").copy_(1.0 / values.std(dim=0).clamp(min=1e-3))
+            scale = 1.0 / values.std(dim=0).clamp(min=1e-3)
+            getattr(self, f"{name}_scale").copy_(scale)
+            getattr(self, f"{name}_shift").copy_(-values.mean(dim=0) * scale)
 
     def forward(self, robot_state: Tensor, goal: Tensor) -> Tensor:
         """Scores of the bins; the last one stands for *never arrives*.
@@ -99,11 +101,11 @@ class ETANetwork(Pretrained, nn.Module):
         """
         if not torch.compiler.is_compiling():
             self._check(robot_state, goal)
-        state = (robot_state - self.state_offset) * self.state_scale
-        target = (self._goal_features(robot_state, goal) - self.goal_offset) * self.goal_scale
-        hidden = torch.relu(self.state_in(state) + self.goal_in(target))
-        hidden = torch.relu(self.second(hidden))
-        return self.head(torch.relu(self.third(hidden)))
+        state = torch.addcmul(self.state_shift, robot_state, self.state_scale)
+        target = torch.addcmul(self.goal_shift, self._goal_features(robot_state, goal), self.goal_scale)
+        hidden = (self.state_in(state) + self.goal_in(target)).relu_()
+        rows = self.third(self.second(hidden.view(-1, self.config.hidden)).relu_()).relu_()
+        return self.head(rows).view(*hidden.shape[:-1], self.config.bins + 1)
 
     def arrival(self, robot_state: Tensor, goal: Tensor, *, reading: str = "mode") -> Arrival:
         """Arrival time at ``goal (*B, 3)`` from ``robot_state (*B, S)``, batches broadcasting as in `forward`.
@@ -120,11 +122,9 @@ class ETANetwork(Pretrained, nn.Module):
         """Goal, its offset from the tool, level and full distance: ``(*B, 8)``."""
         first, last = self.config.tool_slice
         offset = goal - robot_state[..., first:last]
-        square = offset.square()
-        level = square[..., :2].sum(dim=-1, keepdim=True)
-        # The square root's slope is infinite at zero distance.
-        distance = (torch.cat([level, level + square[..., 2:]], dim=-1) + 1e-8).sqrt()
-        return torch.cat([goal.expand(offset.shape), offset, distance], dim=-1)
+        level = torch.linalg.vector_norm(offset[..., :2], dim=-1, keepdim=True)
+        full = torch.linalg.vector_norm(offset, dim=-1, keepdim=True)
+        return torch.cat([goal.expand(offset.shape), offset, level, full], dim=-1)
 
     def _check(self, robot_state: Tensor, goal: Tensor) -> None:
         device = self.head.weight.device
@@ -142,12 +142,11 @@ def decode_mode(logits: Tensor, *, bin_width: int = 5) -> Arrival:
         bin_width: control steps in a bin.
 
     Returns:
-        `Arrival` of ``(*B,)``; ``never`` where the last class is the likeliest.
+        `Arrival` of ``(*B,)``; ``never`` where the last class is the likeliest, with a time beyond the bins.
     """
-    bins = logits.shape[-1] - 1
-    never = logits.argmax(dim=-1) == bins
-    steps = bin_width * logits[..., :bins].argmax(dim=-1) + (bin_width - 1) // 2
-    return Arrival(steps.to(logits.dtype), never)
+    likeliest = logits.argmax(dim=-1)
+    steps = bin_width * likeliest + (bin_width - 1) // 2
+    return Arrival(steps.to(logits.dtype), likeliest == logits.shape[-1] - 1)
 
 
 def decode_expectation(logits: Tensor, *, bin_width: int = 5) -> Arrival:
@@ -160,11 +159,19 @@ def decode_expectation(logits: Tensor, *, bin_width: int = 5) -> Arrival:
     Returns:
         `Arrival` of ``(*B,)``; ``never`` where *never* is likelier than all bins together.
     """
-    bins = logits.shape[-1] - 1
-    share = logits.softmax(dim=-1)
-    arrives, never = share[..., :bins], share[..., bins]
-    middle = bin_width * torch.arange(bins, device=logits.device, dtype=logits.dtype) + (bin_width - 1) / 2
-    return Arrival((arrives @ middle) / (1.0 - never).clamp_min(1e-12), never > 0.5)
+    moments = _moments(logits.shape[-1] - 1, bin_width, logits.device, logits.dtype)
+    arrives, weighted = (logits.softmax(dim=-1) @ moments).unbind(-1)
+    return Arrival(weighted / arrives.clamp_min(1e-12), arrives < 0.5)
+
+
+@lru_cache(maxsize=32)
+def _moments(bins: int, bin_width: int, device: torch.device, dtype: torch.dtype) -> Tensor:
+    """What turns probabilities of the classes into that of arriving and the sum of times, ``(bins + 1, 2)``."""
+    with torch.inference_mode(mode=False):
+        middle = bin_width * torch.arange(bins + 1, device=device, dtype=dtype) + (bin_width - 1) / 2
+        moments = torch.stack([torch.ones_like(middle), middle], dim=-1)
+        moments[-1] = 0.0
+    return moments
 
 
 READINGS = {"mode": decode_mode, "expectation": decode_expectation}

@@ -66,6 +66,8 @@ class Forecaster(Pretrained, nn.Module):
     config_type = ForecasterConfig
     symmetries: Tensor
     steps_ahead: Tensor
+    _step_scale: Tensor
+    _present_scale: Tensor
     _time: Tensor
     _scale: Tensor
 
@@ -75,23 +77,31 @@ class Forecaster(Pretrained, nn.Module):
         self.config = config = config or ForecasterConfig(**settings)
         channels, length = config.channels, config.history - 1
         self.embed = nn.Conv1d(7, channels, 1)
-        self.convolve = nn.ModuleList(
-            nn.Conv1d(channels, channels, 3, stride=2, padding=1) for _ in range(config.convolutions)
-        )
+        self.convolve = nn.ModuleList(nn.Conv1d(channels, channels, 3, stride=2) for _ in range(config.convolutions))
         for _ in range(config.convolutions):
-            length = (length + 1) // 2
-        self.join = nn.Linear(channels * length + self._present_size, config.hidden)
+            length = max(length // 2, 1)
+        step = [1.0 / config.step_scale] * 3
+        present = [1.0 / config.length_scale] * 3 + step
+        if config.half_extent is not None:
+            present += [1.0 / config.horizon] * 2 + [0.25] * 2 + [1.0 / config.length_scale] * 2
+        self.join = nn.Linear(channels * length + len(present), config.hidden)
         self.hidden = nn.Linear(config.hidden, config.hidden)
         self.mix = nn.Linear(config.hidden, config.rank)
         self.head = nn.Linear(config.rank, 3 * config.horizon)
         nn.init.zeros_(self.head.bias)
         self.head.weight.data.mul_(0.1)
-        self.register_buffer("symmetries", square_symmetries(), persistent=False)
         steps = torch.arange(1.0, config.horizon + 1.0)
         level, height = config.step_scale * steps, torch.full_like(steps, config.height_scale)
-        self.register_buffer("steps_ahead", steps, persistent=False)
-        self.register_buffer("_time", torch.stack([steps, steps, torch.zeros_like(steps)]), persistent=False)
-        self.register_buffer("_scale", torch.stack([level, level, height]), persistent=False)
+        constants = {
+            "symmetries": square_symmetries(),
+            "steps_ahead": steps,
+            "_step_scale": torch.tensor([*step, 0.2, 0.2, 0.2, 1.0]),
+            "_present_scale": torch.tensor(present),
+            "_time": torch.stack([steps, steps, torch.zeros_like(steps)]),
+            "_scale": torch.stack([level, level, height]),
+        }
+        for name, value in constants.items():
+            self.register_buffer(name, value, persistent=False)
 
     def forward(self, target_history: Tensor) -> Tensor:
         """Positions at the next F control steps.
@@ -105,67 +115,59 @@ class Forecaster(Pretrained, nn.Module):
         Raises:
             InputError: the history has another shape, another device than the network, or holds a NaN.
         """
-        if not torch.compiler.is_compiling():
-            self._check(target_history)
-        turn, line = self._line(target_history)
-        if self.config.half_extent is not None:
-            level, height = line.split([2, 1], dim=-2)
-            line = torch.cat([fold(level, self.config.half_extent), height], dim=-2)
-        return line.mT if turn is None else (turn @ line).mT
+        return self._forecast(target_history, folded=self.config.half_extent is not None)
 
     def unfolded(self, target_history: Tensor) -> Tensor:
         """Same as `forward` before cushions mirror the line: what training compares, ``(*B, F, 3)`` [m, world]."""
-        turn, line = self._line(target_history)
-        return line.mT if turn is None else (turn @ line).mT
+        return self._forecast(target_history, folded=False)
 
-    def _line(self, target_history: Tensor) -> tuple[Tensor | None, Tensor]:
-        """Unfolded line (*B, 3, F) of the turned history, and the matrix (*B, 3, 3) that turns it back."""
-        now, step = target_history[..., -1, :], target_history.diff(dim=-2)
-        if not self.config.square_symmetry:
-            return None, self._line_ahead(now, step)
-        # A pinch of position decides for a target that moves along an axis or lies still.
-        direction = step[..., -1, :2] + 1e-6 * now[..., :2]
-        turn = self.symmetries[octant(direction)]
-        return turn, self._line_ahead((now.unsqueeze(-2) @ turn).squeeze(-2), step @ turn)
+    def _forecast(self, target_history: Tensor, *, folded: bool) -> Tensor:
+        if not torch.compiler.is_compiling():
+            self._check(target_history)
+        config = self.config
+        history, turn = target_history.reshape(-1, config.history, 3), None
+        if config.square_symmetry:
+            now, before = history[:, -1, :2], history[:, -2, :2]
+            # A pinch of position decides for a target that moves along an axis or lies still.
+            turn = self.symmetries[octant(torch.add(now - before, now, alpha=1e-6))]
+            history = torch.bmm(history, turn)
+        line = self._line(history)
+        if folded:
+            assert config.half_extent is not None
+            line = torch.cat([fold(line[:, :2], config.half_extent), line[:, 2:]], dim=1)
+        if turn is not None:
+            line = torch.bmm(turn, line)
+        return line.mT.view(*target_history.shape[:-2], config.horizon, 3)
 
-    def _line_ahead(self, now: Tensor, step: Tensor) -> Tensor:
-        """Positions ``(*B, 3, F)`` after the newest position ``(*B, 3)`` and the steps ``(*B, H-1, 3)`` [m]."""
-        config, batch = self.config, step.shape[:-2]
-        features = self._step_features(step).reshape(-1, step.shape[-2], 7)
+    def _line(self, history: Tensor) -> Tensor:
+        """Unfolded positions ``(R, 3, F)`` after the turned histories ``(R, H, 3)`` [m]."""
+        now, step = history[:, -1], history[:, 1:] - history[:, :-1]
+        newest = step[:, -1]
+        features = self._step_features(step)
         for layer in (self.embed, *self.convolve):
-            features = torch.relu(_convolve(features, layer))
-        present = self._present_features(now, step[..., -1, :])
-        joined = torch.cat([features.mT.reshape(*batch, -1), present], dim=-1)
-        hidden = torch.relu(self.hidden(torch.relu(self.join(joined))))
-        departure = self.head(self.mix(hidden)).unflatten(-1, (3, config.horizon))
-        straight = torch.addcmul(now.unsqueeze(-1), step[..., -1, :].unsqueeze(-1), self._time)
+            features = _convolve(features, layer).relu_()
+        joined = torch.cat([features.flatten(1), self._present_features(now, newest)], dim=-1)
+        hidden = self.hidden(self.join(joined).relu_()).relu_()
+        departure = self.head(self.mix(hidden)).view(-1, 3, self.config.horizon)
+        straight = torch.addcmul(now.unsqueeze(-1), newest.unsqueeze(-1), self._time)
         return torch.addcmul(straight, departure, self._scale)
 
     def _step_features(self, step: Tensor) -> Tensor:
-        """Each step, its difference from the newest one, and whether it is no padding, ``(*B, H-1, 7)``."""
-        real = (step != 0).any(dim=-1, keepdim=True).to(step.dtype)
+        """Each step, its difference from the newest one, and whether it is no padding, ``(R, H-1, 7)``."""
+        real = (step != 0).any(dim=-1, keepdim=True)
         # Braking changes a step by a thousandth, a bounce by twice itself: a logarithm shows both.
-        change = torch.asinh((step - step[..., -1:, :]) / self.config.change_scale) * real
-        return torch.cat([step / self.config.step_scale, 0.2 * change, real], dim=-1)
+        change = torch.asinh((step - step[:, -1:]) * (real / self.config.change_scale))
+        return torch.cat([step, change, real.to(step.dtype)], dim=-1) * self._step_scale
 
     def _present_features(self, now: Tensor, step: Tensor) -> Tensor:
-        """Newest position and step, ``(*B, 3)`` each, and when and where they lead to a cushion: ``(*B, P)``."""
-        config = self.config
-        features = [now / config.length_scale, step / config.step_scale]
-        if config.half_extent is not None:
-            ahead = config.half_extent - now[..., :2] * _direction(step[..., :2])
-            wait = (ahead / step[..., :2].abs().clamp(min=1e-6)).clamp(0.0, 2.0 * config.horizon)
-            meeting = now[..., :2] + step[..., :2] * wait.flip(-1)
-            features += [
-                wait / config.horizon,
-                torch.log1p(wait) / 4,
-                fold(meeting, config.half_extent) / config.length_scale,
-            ]
-        return torch.cat(features, dim=-1)
-
-    @property
-    def _present_size(self) -> int:
-        return 6 if self.config.half_extent is None else 12
+        """Newest position and step, ``(R, 3)`` each, and when and where they lead to a cushion: ``(R, P)``."""
+        features, extent, horizon = [now, step], self.config.half_extent, self.config.horizon
+        if extent is not None:
+            place, speed = now[:, :2], step[:, :2]
+            direction = torch.where(speed < 0, -1.0, 1.0)
+            wait = (extent - place * direction).div_((speed * direction).clamp_min(1e-6)).clamp(0.0, 2.0 * horizon)
+            features += [wait, wait.log1p(), fold(torch.addcmul(place, speed, wait.flip(-1)), extent)]
+        return torch.cat(features, dim=-1) * self._present_scale
 
     def _check(self, target_history: Tensor) -> None:
         check_trailing_shape("target_history", target_history, self.config.history, 3)
@@ -174,12 +176,16 @@ class Forecaster(Pretrained, nn.Module):
 
 
 def _convolve(features: Tensor, layer: Any) -> Tensor:
-    """What ``layer`` makes of ``features`` (R, L, C), as a matrix product: faster for few rows and channels."""
-    size, stride, margin = layer.kernel_size[0], layer.stride[0], int(layer.padding[0])
-    padded = nn.functional.pad(features, (0, 0, margin, margin)) if margin else features
-    seen = padded.unfold(-2, size, stride).flatten(-2)
+    """What ``layer`` makes of ``features`` (R, L, C), as a matrix product: faster for few rows and channels.
+
+    Steps are repeated at the old end, where they are too few for the last window to end with the newest one.
+    """
+    size, stride = layer.kernel_size[0], layer.stride[0]
+    if size == 1:
+        return nn.functional.linear(features, layer.weight.squeeze(-1), layer.bias)
+    length = features.shape[1]
+    missing = size - length if length < size else (size - length) % stride
+    if missing:
+        features = torch.cat([features[:, :1].expand(-1, missing, -1), features], dim=1)
+    seen = features.unfold(1, size, stride).flatten(2)
     return nn.functional.linear(seen, layer.weight.flatten(1), layer.bias)
-
-
-def _direction(step: Tensor) -> Tensor:
-    return torch.where(step < 0, -1.0, 1.0)

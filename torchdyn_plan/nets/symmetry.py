@@ -20,7 +20,6 @@ def octant(direction: Tensor) -> Tensor:
     Returns:
         ``(*B,)`` int64 index into `square_symmetries`.
     """
-    negative = direction < 0
-    size = direction.abs()
-    swap = size[..., 1] > size[..., 0]
-    return negative[..., 0] + 2 * negative[..., 1] + 4 * swap
+    left, below = (direction < 0).long().unbind(-1)
+    x, y = direction.abs().unbind(-1)
+    return torch.add(torch.add(left, below, alpha=2), (y > x).long(), alpha=4)

@@ -105,9 +105,7 @@ class DynamicPlanner(TensorDictModuleBase):
         if history is not None:
             length = getattr(getattr(self.forecaster, "config", None), "history", history.shape[-2])
             check_trailing_shape(keys.TARGET_HISTORY, history, length, 3)
-            # The sum is a quick look: only a sum that is not finite is worth the full one.
-            if not torch.isfinite(history.sum()):
-                check_finite(keys.TARGET_HISTORY, history)
+            check_finite(keys.TARGET_HISTORY, history)
 
     @classmethod
     def from_pretrained(cls, name: str, *, chunk: int | None = None) -> DynamicPlanner:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import lru_cache
 from typing import TYPE_CHECKING
 
 import torch
@@ -14,6 +15,10 @@ from torchdyn_plan.planners.search import SearchResult
 
 if TYPE_CHECKING:
     from torchdyn_plan.nets.eta import Arrival
+
+
+KEPT = 2
+"""A candidate whose time differs by so many control steps from that of the meeting planned before is the same one."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -91,23 +96,25 @@ class ExactSearch:
         if planned_steps is not None:
             check_trailing_shape("planned_steps", planned_steps, *target_pos.shape[:-1])
         path = torch.cat([target_pos.unsqueeze(-2), forecast], dim=-2)
-        steps = torch.arange(min(2, horizon), horizon + 1, self.stride, device=path.device)
-        goals = self.goals(path[..., steps, :])
+        first = min(2, horizon)
+        steps = _steps(first, horizon + 1, self.stride, path.device)
+        places = path[..., first :: self.stride, :]
+        goals = self.goals(places)
         arrival = eta(goals, reading="expectation")
         needed = arrival.steps.masked_fill(arrival.never, torch.inf)
         if tool_pos is not None and self.arrived > 0.0:
             away = (goals - tool_pos.unsqueeze(-2))[..., :2].square().sum(-1)
             needed = needed.masked_fill(away < self.arrived**2, 0.0)
 
-        before, stay = self.stays(path, goals, steps)
+        before, stay = self.stays(path, goals, first)
         comes = steps - before
-        score = stay.to(path.dtype) - self.patience * steps
+        score = stay - self.patience * steps
         early = comes - self.lead - needed
         slack = early - self.margin
         if planned_steps is not None:
-            kept = (comes - planned_steps.unsqueeze(-1)).abs() <= self.stride + 1
+            kept = (comes - planned_steps.unsqueeze(-1)).abs() <= KEPT
             score, slack = score + self.loyalty * kept, torch.where(kept, early, slack)
-        on_table = path[..., steps, 2] > 0.0
+        on_table = places[..., 2] > 0.0
         in_time = (slack >= 0.0) & (stay > 0) & on_table
         nothing = ~in_time.any(dim=-1, keepdim=True)
         # Worse and worse: late, out of the box's reach, never reached by the robot, below the table.
@@ -123,34 +130,42 @@ class ExactSearch:
 
     def goals(self, places: Tensor) -> Tensor:
         """Where the tool is sent to meet a target at ``places`` (*B, 3) [m, world]."""
+        level, height = places[..., :2], places[..., 2:]
         if self.half_extent is not None:
-            level = places[..., :2].clamp(-self.half_extent, self.half_extent)
-            places = torch.cat([level, places[..., 2:]], dim=-1)
-        if self.height is None:
-            return places
-        return torch.cat([places[..., :2], torch.full_like(places[..., 2:], self.height)], dim=-1)
+            level = level.clamp(-self.half_extent, self.half_extent)
+        if self.height is not None:
+            return torch.nn.functional.pad(level, (0, 1), value=self.height)
+        return places if self.half_extent is None else torch.cat([level, height], dim=-1)
 
-    def stays(self, path: Tensor, goals: Tensor, steps: Tensor) -> tuple[Tensor, Tensor]:
+    def stays(self, path: Tensor, goals: Tensor, first: int) -> tuple[Tensor, Tensor]:
         """How many steps before each candidate the target is at its place already, and how long it stays in all.
 
         Args:
             path: ``(*B, F + 1, 3)`` [m, world], the target now and in 1 … F steps.
-            goals: ``(*B, K, 3)`` [m, world].
-            steps: ``(K,)``, when the target is nearest to each.
+            goals: ``(*B, K, 3)`` [m, world], at every ``stride``-th position of the path from the ``first`` on.
+            first: step of the first candidate.
 
         Returns:
             Both ``(*B, K)`` int64, in control steps; the stay is 0 where the target never comes within the footprint.
-            The past does not count; after the forecast's end the target rests where it is.
+            Neither the past counts nor what comes after the forecast.
         """
         if self.footprint == 0.0:
             one = torch.ones(goals.shape[:-1], dtype=torch.int64, device=goals.device)
             return torch.zeros_like(one), one
-        around = torch.arange(-self.longest_stay, self.longest_stay + 1, device=steps.device)
-        index = steps.unsqueeze(-1) + around
-        near = path[..., index.clamp(0, path.shape[-2] - 1), :]
-        away = (near[..., :2] - goals[..., :2].unsqueeze(-2)).abs().amax(-1)
-        there = (away <= self.footprint) & (near[..., 2] > 0.0) & (index >= 0)
-        after = there[..., self.longest_stay :].long().cumprod(-1).sum(-1)
-        before = there[..., : self.longest_stay + 1].flip(-1).long().cumprod(-1).sum(-1)
-        stay = (before + after - 1).clamp(0, self.longest_stay)
-        return (before - 1).clamp_min(0), stay
+        longest = self.longest_stay
+        level = torch.where(path[..., 2:] > 0.0, path[..., :2], torch.inf)
+        level = torch.nn.functional.pad(level, (0, 0, longest, longest), value=torch.inf)
+        # Windows around the candidates are views: nothing is copied before the difference.
+        around = level[..., first:, :].unfold(-2, 2 * longest + 1, self.stride)
+        gone = ~((around - goals[..., :2].unsqueeze(-1)).abs().amax(-2) <= self.footprint)
+        number = torch.arange(1, longest + 2, device=path.device)
+        before = longest + 1 - (gone[..., : longest + 1] * number).amax(-1)
+        after = torch.where(gone[..., longest:], number, longest + 2).amin(-1) - 1
+        return (before - 1).clamp_min(0), (before + after - 1).clamp(0, longest)
+
+
+@lru_cache(maxsize=32)
+def _steps(first: int, end: int, stride: int, device: torch.device) -> Tensor:
+    """Steps of the candidates."""
+    with torch.inference_mode(mode=False):
+        return torch.arange(first, end, stride, device=device)

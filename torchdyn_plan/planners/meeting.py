@@ -34,7 +34,7 @@ class MeetingPlanner(DynamicPlanner):
 
     History → forecast → meeting (`ExactSearch`, with goals above the table) → ``goal``: above the meeting place until
     `Drop` finds that now is the time, then down over the target, following it; and up to the next meeting if it was
-    missed. The static planner hears of all that through the goal alone. It re-plans often, every 4 steps by default.
+    missed. The static planner hears of all that through the goal alone. It re-plans often, every 5 steps by default.
     Rows whose forecast holds a NaN or an infinity stay where they are, take the target to rest and are not `reachable`.
     """
 
@@ -48,8 +48,8 @@ class MeetingPlanner(DynamicPlanner):
         schedule: ReplanSchedule | None = None,
         drop: Drop | None = None,
         table_height: float = 0.042,
-        pull: float = 0.03,
-        lead: int = 3,
+        pull: float = 0.044,
+        lead: int = 7,
         chunk: int | None = None,
     ) -> None:
         """Join the parts.
@@ -59,14 +59,15 @@ class MeetingPlanner(DynamicPlanner):
             forecaster: as for `DynamicPlanner`.
             eta: tells how long ``static`` needs to a goal.
             search: chooses where to wait, and when for.
-            schedule: when to plan anew; every 4 steps from step 13 by default.
+            schedule: when to plan anew; every 5 steps from step 13 by default. A multiple of the search's stride keeps
+                its candidates on the same places of the path, and so the tool still while it waits.
             drop: sizes and the descent of ``static``.
             table_height: height of a goal that brings the box down [m].
             pull: the goal of a dropping box is at most so far from it, sideways [m].
-            lead: it follows the target this many steps ahead, as many as ``static`` lags behind.
+            lead: it is sent to where the target will be in so many steps: what ``static`` lags behind, and more.
             chunk: plan in blocks of exactly this many rows, so that results do not depend on the batch size.
         """
-        schedule = schedule or ReplanSchedule(window=4, shrink=1.0, minimum=4)
+        schedule = schedule or ReplanSchedule(window=5, shrink=1.0, minimum=5)
         super().__init__(static, forecaster, eta, search=search or WAITING, schedule=schedule, chunk=chunk)
         self.search: ExactSearch
         self.drop, self.table_height, self.pull, self.lead = drop or Drop(), table_height, pull, lead
@@ -171,7 +172,8 @@ class MeetingPlanner(DynamicPlanner):
         above = (tool_pos[..., 2] > 0.95 * 2 * drop.radius) & (path[..., 2] > 0.0).all(-1)
         step = torch.where((step < 0) & started & now & above, 0, step)
         outside = (target_pos - tool_pos)[..., :2].abs().amax(-1) > drop.half_width + 0.01
-        missed = (outside & (step > 8)) | (step > 40)
+        down = tool_pos[..., 2] < 1.2 * drop.radius
+        missed = (outside & down & (step > 8)) | (step > 40)
         return torch.where(missed, -1, step)
 
     def _goal(self, meeting: SearchResult, path: Tensor, tool_pos: Tensor, drop_step: Tensor) -> Tensor:
@@ -179,7 +181,7 @@ class MeetingPlanner(DynamicPlanner):
         level = tool_pos[..., :2]
         way = path[..., self.lead, :2] - level
         length = way.square().sum(-1, keepdim=True).sqrt().clamp_min(1e-9)
-        follow = (drop_step >= 3).unsqueeze(-1)
+        follow = (drop_step >= 2).unsqueeze(-1)
         down = level + torch.where(follow, way * (length.clamp_max(self.pull) / length), 0.0)
         if self.search.half_extent is not None:
             down = down.clamp(-self.search.half_extent, self.search.half_extent)

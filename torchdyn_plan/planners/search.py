@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from functools import partial
+from functools import lru_cache, partial
 from typing import TYPE_CHECKING, Literal, NamedTuple
 
 import torch
@@ -72,12 +72,12 @@ def search_corners(forecast: Tensor, target_pos: Tensor, eta: Callable[[Tensor],
     check_trailing_shape("forecast", forecast, *target_pos.shape[:-1], horizon, 3)
     path = torch.cat([target_pos.unsqueeze(-2), forecast], dim=-2)
 
-    here = eta(target_pos.unsqueeze(-2))
+    here = eta(path[..., :1, :])
     steps, beyond_here = _on_path(here.steps, horizon)
-    steps = torch.where(here.never, horizon, steps)
-    half_edge = torch.linalg.vector_norm(_at(path, steps) - target_pos.unsqueeze(-2), dim=-1, keepdim=True)
+    away = _at(path, torch.where(here.never, horizon, steps)) - path[..., :1, :]
+    half_edge = torch.linalg.vector_norm(away, dim=-1, keepdim=True)
 
-    corners = target_pos.unsqueeze(-2) + half_edge * target_pos.new_tensor(CORNERS)
+    corners = torch.addcmul(path[..., :1, :], half_edge, _corners(path.device, path.dtype))
     arrival = eta(corners)
     steps, beyond = _on_path(arrival.steps, horizon)
     met = _at(path, steps)
@@ -90,6 +90,13 @@ def search_corners(forecast: Tensor, target_pos: Tensor, eta: Callable[[Tensor],
         clamped=(beyond.gather(-1, best) | (beyond_here & ~here.never)).squeeze(-1),
         reachable=~nowhere.squeeze(-1),
     )
+
+
+@lru_cache(maxsize=32)
+def _corners(device: torch.device, dtype: torch.dtype) -> Tensor:
+    """Corners of a square of half-edge one, ``(4, 3)``."""
+    with torch.inference_mode(mode=False):
+        return torch.tensor(CORNERS, device=device, dtype=dtype)
 
 
 def _on_path(steps: Tensor, horizon: int) -> tuple[Tensor, Tensor]:
