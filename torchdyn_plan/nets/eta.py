@@ -16,7 +16,7 @@ class Arrival(NamedTuple):
     """When, and whether, the robot arrives."""
 
     steps: Tensor
-    """``(*B,)`` control steps from now, in the network's dtype; counts only where ``never`` is False."""
+    """``(*B,)`` control steps from now, in the network's dtype; where ``never`` is True, if it arrived after all."""
     never: Tensor
     """``(*B,)`` bool: the goal is not reached within the bins."""
 
@@ -142,11 +142,12 @@ def decode_mode(logits: Tensor, *, bin_width: int = 5) -> Arrival:
         bin_width: control steps in a bin.
 
     Returns:
-        `Arrival` of ``(*B,)``; ``never`` where the last class is the likeliest, with a time beyond the bins.
+        `Arrival` of ``(*B,)``; ``never`` where the last class is the likeliest, with the likeliest bin all the same.
     """
-    likeliest = logits.argmax(dim=-1)
-    steps = bin_width * likeliest + (bin_width - 1) // 2
-    return Arrival(steps.to(logits.dtype), likeliest == logits.shape[-1] - 1)
+    bins = logits.shape[-1] - 1
+    never = logits.argmax(dim=-1) == bins
+    steps = bin_width * logits[..., :bins].argmax(dim=-1) + (bin_width - 1) // 2
+    return Arrival(steps.to(logits.dtype), never)
 
 
 def decode_expectation(logits: Tensor, *, bin_width: int = 5) -> Arrival:

@@ -24,7 +24,8 @@ from torchdyn_plan.planners.search import SearchResult
 DROP_NAMES = ("outlook", "outlook_age", "drop_step", "tool_before")
 
 WAITING = ExactSearch(
-    height=0.105, half_extent=0.722, lead=7.0, margin=15.0, footprint=0.055, loyalty=8.0, arrived=0.015
+    height=0.105, half_extent=0.722, lead=7.0, margin=15.0, footprint=0.055, longest_stay=12, patience=0.01,
+    loyalty=8.0, arrived=0.015,
 )  # fmt: skip
 """Meets Trapper's ball: waits with the rim 2 cm above it, as far out as the rails let the box stand."""
 
@@ -173,8 +174,7 @@ class MeetingPlanner(DynamicPlanner):
         step = torch.where((step < 0) & started & now & above, 0, step)
         outside = (target_pos - tool_pos)[..., :2].abs().amax(-1) > drop.half_width + 0.01
         down = tool_pos[..., 2] < 1.2 * drop.radius
-        missed = (outside & down & (step > 8)) | (step > 40)
-        return torch.where(missed, -1, step)
+        return torch.where(outside & (step > 8) & (down | (step > 40)), -1, step)
 
     def _goal(self, meeting: SearchResult, path: Tensor, tool_pos: Tensor, drop_step: Tensor) -> Tensor:
         """Above the meeting place, or down: first where the tool is, then after the target."""

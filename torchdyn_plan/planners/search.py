@@ -53,8 +53,8 @@ def search_corners(forecast: Tensor, target_pos: Tensor, eta: Callable[[Tensor],
     corners c_i, reached in e_i = ETA(c_i) steps, c* is the one nearest to the forecast, argmin D(c_i, s̃_{e_i}); its
     time is e* and the goal g̃ = s̃_{e*}. D is the distance in space; the first of equal corners wins.
 
-    A corner at which the robot never arrives is chosen only if it never arrives at any, which `reachable` tells. If
-    it never arrives at the target's present place, the horizon's end gives the half-edge.
+    A corner at which the robot never arrives is chosen only if it never arrives at any, which `reachable` tells.
+    Where it never arrives, its time is the one that the predictor finds likeliest if it did.
 
     Args:
         forecast: ``(*B, F, 3)`` [m, world], target positions in 1 … F control steps; a meeting in e steps is entry e-1.
@@ -74,7 +74,7 @@ def search_corners(forecast: Tensor, target_pos: Tensor, eta: Callable[[Tensor],
 
     here = eta(path[..., :1, :])
     steps, beyond_here = _on_path(here.steps, horizon)
-    away = _at(path, torch.where(here.never, horizon, steps)) - path[..., :1, :]
+    away = _at(path, steps) - path[..., :1, :]
     half_edge = torch.linalg.vector_norm(away, dim=-1, keepdim=True)
 
     corners = torch.addcmul(path[..., :1, :], half_edge, _corners(path.device, path.dtype))
@@ -87,7 +87,7 @@ def search_corners(forecast: Tensor, target_pos: Tensor, eta: Callable[[Tensor],
     return SearchResult(
         goal=_at(met, best).squeeze(-2),
         arrival_steps=steps.gather(-1, best).squeeze(-1),
-        clamped=(beyond.gather(-1, best) | (beyond_here & ~here.never)).squeeze(-1),
+        clamped=(beyond.gather(-1, best) | beyond_here).squeeze(-1),
         reachable=~nowhere.squeeze(-1),
     )
 
