@@ -54,15 +54,17 @@ class DampedSteps(nn.Module):
         own = cast(dict[str, Tensor], self._buffers)
         # The error is linear in the pose, by a matrix that is linear in the target.
         to_error = torch.addmm(own["_error"], target, own["_error_of_target"]).view(-1, 6, 16)
+        column, form = q.unsqueeze(-1), self.arm.form
         for _ in range(self.steps):
-            pose, jacobian = self.arm.form.pose_and_jacobian(q)
+            pose, jacobian = form.pose_and_jacobian(q)
             error = torch.bmm(to_error, pose.view(-1, 16, 1))
             transposed = jacobian.mT
             factor, _ = torch.linalg.cholesky_ex(torch.baddbmm(own["_ridge"], jacobian, transposed))
             # Two triangular solves take half the time of `cholesky_solve`.
             half = torch.linalg.solve_triangular(factor, error, upper=False)
             weights = torch.linalg.solve_triangular(factor.mT, half, upper=True)
-            q = torch.baddbmm(q.unsqueeze(-1), transposed, weights).squeeze(-1)
+            column = torch.baddbmm(column, transposed, weights)
+            q = column.squeeze(-1)
         return q
 
     def _columns(self, joint_pos: Columns, target: Columns) -> tuple[Vector]:

@@ -126,7 +126,7 @@ def fit_eta(
     data: Path,
     out: Path,
     *,
-    steps: int = 32_000,
+    steps: int = 64_000,
     batch: int = 1024,
     lr: float = 2e-3,
     seed: int = 0,
