@@ -122,6 +122,14 @@ def test_plans_at_steps_13_18_23_and_stays_until_the_first():
     assert len(planner.eta.shapes) == len(planner.forecaster.rows) == len(due)
 
 
+def test_the_place_of_a_kept_meeting_does_not_move_from_plan_to_plan():
+    found = line().run(make_planner(), 140)
+    start = next(step for step, td in enumerate(found) if int(td["plan", "drop_step"]) >= 0)
+    goals = torch.stack([td["goal"] for td in found[13:start]])
+    assert sum(bool(td["plan", "replanned"]) for td in found[13:start]) > 5
+    torch.testing.assert_close(goals, goals[:1].expand_as(goals), rtol=0, atol=1e-5)
+
+
 def test_a_meeting_is_kept_and_comes_one_step_nearer():
     found = line().run(make_planner(), 36)
     for before, td in itertools.pairwise(found[13:]):
