@@ -31,11 +31,13 @@ from torchdyn_plan.evaluation.solvability import arrival_map
 from torchdyn_plan.files import write_json
 from torchdyn_plan.kinematics import Arm
 from torchdyn_plan.planners import IKPlanner
-from torchdyn_plan.planners.meeting import WAITING
+from torchdyn_plan.planners.meeting import FOLLOW_AFTER, WAITING, pulled
 from torchdyn_plan.versions import library_versions, machine
 
 START = 13
 """Step at which a schedule starts, and until which the arm stays at home."""
+PULL = 0.044
+"""A box that follows is sent so far ahead of itself at most [m], as `MeetingPlanner` does."""
 SOONEST = 12
 """A schedule is tried where the arm would be down at the place this many steps late, at worst."""
 
@@ -136,8 +138,9 @@ def simulate(
             simulation.step(torch.zeros(count, 6))
             continue
         after = future[:, min(step + ahead, future.shape[1] - 1)]
-        down = torch.where((follows & (step >= drop + 2)).unsqueeze(-1), _towards(tool, after), above)
-        down = torch.cat([down[:, :2], torch.full((count, 1), scene.ball_radius)], dim=-1)
+        level = pulled(tool[:, :2], after[:, :2], PULL).clamp(-WAITING.half_extent, WAITING.half_extent)
+        level = torch.where((follows & (step >= drop + FOLLOW_AFTER)).unsqueeze(-1), level, above[:, :2])
+        down = torch.nn.functional.pad(level, (0, 1), value=scene.ball_radius)
         goal = torch.where((step >= drop).unsqueeze(-1), down, above)
         entries = {keys.JOINT_POS: joint_pos, keys.GOAL: goal, keys.STEP_COUNT: torch.full((count,), step)}
         if memory is not None:
@@ -146,13 +149,6 @@ def simulate(
         memory = planned[keys.PLAN]
         simulation.step(planned[keys.ACTION])
     return trapped
-
-
-def _towards(tool: Tensor, after: Tensor, pull: float = 0.044) -> Tensor:
-    way = (after - tool)[:, :2]
-    length = way.norm(dim=-1, keepdim=True).clamp_min(1e-9)
-    level = tool[:, :2] + way * (length.clamp_max(pull) / length)
-    return torch.cat([level.clamp(-WAITING.half_extent, WAITING.half_extent), tool[:, 2:]], dim=-1)
 
 
 def _meetings(arguments: Arguments, needed: Tensor, future: Tensor) -> tuple[Tensor, Tensor]:

@@ -1,7 +1,6 @@
 """When the robot can be somewhere: a classifier of arrival times, as a static planner would drive it there."""
 
 from dataclasses import dataclass
-from functools import lru_cache
 from typing import Any, NamedTuple
 
 import torch
@@ -23,7 +22,7 @@ class Arrival(NamedTuple):
 
 @dataclass(frozen=True, kw_only=True)
 class ETAConfig:
-    """Sizes of an `ETANetwork`; the defaults are the paper's for a UR5."""
+    """Sizes of an `ETANetwork`; for a UR5 by default, with the bins of the paper."""
 
     robot_state_size: int = 15
     """Size S of the robot state."""
@@ -160,19 +159,12 @@ def decode_expectation(logits: Tensor, *, bin_width: int = 5) -> Arrival:
     Returns:
         `Arrival` of ``(*B,)``; ``never`` where *never* is likelier than all bins together.
     """
-    moments = _moments(logits.shape[-1] - 1, bin_width, logits.device, logits.dtype)
+    bins = logits.shape[-1] - 1
+    middle = bin_width * torch.arange(bins, device=logits.device, dtype=logits.dtype) + (bin_width - 1) / 2
+    # One product, whose last row leaves *never* out: the probability of arriving, and the sum of times.
+    moments = torch.nn.functional.pad(torch.stack([torch.ones_like(middle), middle], dim=-1), (0, 0, 0, 1))
     arrives, weighted = (logits.softmax(dim=-1) @ moments).unbind(-1)
     return Arrival(weighted / arrives.clamp_min(1e-12), arrives < 0.5)
-
-
-@lru_cache(maxsize=32)
-def _moments(bins: int, bin_width: int, device: torch.device, dtype: torch.dtype) -> Tensor:
-    """What turns probabilities of the classes into that of arriving and the sum of times, ``(bins + 1, 2)``."""
-    with torch.inference_mode(mode=False):
-        middle = bin_width * torch.arange(bins + 1, device=device, dtype=dtype) + (bin_width - 1) / 2
-        moments = torch.stack([torch.ones_like(middle), middle], dim=-1)
-        moments[-1] = 0.0
-    return moments
 
 
 READINGS = {"mode": decode_mode, "expectation": decode_expectation}

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from functools import lru_cache
 from typing import TYPE_CHECKING
 
 import torch
@@ -15,10 +14,6 @@ from torchdyn_plan.planners.search import SearchResult
 
 if TYPE_CHECKING:
     from torchdyn_plan.nets.eta import Arrival
-
-
-KEPT = 2
-"""A candidate whose time differs by so many control steps from that of the meeting planned before is the same one."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -88,45 +83,37 @@ class ExactSearch:
         Raises:
             InputError: an argument has another shape, or their batches differ.
         """
-        check_trailing_shape("target_pos", target_pos, 3)
-        horizon = forecast.shape[-2] if forecast.ndim > 1 else 1
-        check_trailing_shape("forecast", forecast, *target_pos.shape[:-1], horizon, 3)
-        if tool_pos is not None:
-            check_trailing_shape("tool_pos", tool_pos, *target_pos.shape)
-        if planned_steps is not None:
-            check_trailing_shape("planned_steps", planned_steps, *target_pos.shape[:-1])
+        horizon = _checked_horizon(forecast, target_pos, tool_pos, planned_steps)
         path = torch.cat([target_pos.unsqueeze(-2), forecast], dim=-2)
         first = min(2, horizon)
-        steps = _steps(first, horizon + 1, self.stride, path.device)
+        steps = torch.arange(first, horizon + 1, self.stride, device=path.device)
         places = path[..., first :: self.stride, :]
         goals = self.goals(places)
-        arrival = eta(goals, reading="expectation")
-        needed = arrival.steps.masked_fill(arrival.never, torch.inf)
-        if tool_pos is not None and self.arrived > 0.0:
-            away = (goals - tool_pos.unsqueeze(-2))[..., :2].square().sum(-1)
-            needed = needed.masked_fill(away < self.arrived**2, 0.0)
-
         before, stay = self.stays(path, goals, first)
         comes = steps - before
         score = stay - self.patience * steps
-        early = comes - self.lead - needed
+        early = comes - self.lead - self._needed(goals, eta, tool_pos)
         slack = early - self.margin
         if planned_steps is not None:
-            kept = (comes - planned_steps.unsqueeze(-1)).abs() <= KEPT
+            # Nearer in time than any other candidate, or as near: the same meeting.
+            kept = (comes - planned_steps.unsqueeze(-1)).abs() <= max(self.stride // 2, 1)
             score, slack = score + self.loyalty * kept, torch.where(kept, early, slack)
-        on_table = places[..., 2] > 0.0
-        in_time = (slack >= 0.0) & (stay > 0) & on_table
-        nothing = ~in_time.any(dim=-1, keepdim=True)
-        # Worse and worse: late, out of the box's reach, never reached by the robot, below the table.
-        late = slack.clamp(min=-1e6) - 1e4 * (stay == 0) - 1e7 * ~on_table
-        score = torch.where(nothing, late, score.masked_fill(~in_time, -torch.inf))
-        best = score.argmax(dim=-1, keepdim=True)
+        best, reachable = _best(score, slack, stay=stay, on_table=places[..., 2] > 0.0)
         return SearchResult(
             goal=goals.gather(-2, best.unsqueeze(-1).expand(*best.shape, 3)).squeeze(-2),
             arrival_steps=comes.gather(-1, best).squeeze(-1),
-            clamped=torch.zeros_like(nothing).squeeze(-1),
-            reachable=~nothing.squeeze(-1),
+            clamped=torch.zeros_like(reachable),
+            reachable=reachable,
         )
+
+    def _needed(self, goals: Tensor, eta: Callable[..., Arrival], tool_pos: Tensor | None) -> Tensor:
+        """Control steps (*B, K) to each goal (*B, K, 3): infinitely many where the robot never arrives."""
+        arrival = eta(goals, reading="expectation")
+        needed = arrival.steps.masked_fill(arrival.never, torch.inf)
+        if tool_pos is None or self.arrived == 0.0:
+            return needed
+        away = (goals - tool_pos.unsqueeze(-2))[..., :2].square().sum(-1)
+        return needed.masked_fill(away < self.arrived**2, 0.0)
 
     def goals(self, places: Tensor) -> Tensor:
         """Where the tool is sent to meet a target at ``places`` (*B, 3) [m, world]."""
@@ -164,8 +151,25 @@ class ExactSearch:
         return (before - 1).clamp_min(0), (before + after - 1).clamp(0, longest)
 
 
-@lru_cache(maxsize=32)
-def _steps(first: int, end: int, stride: int, device: torch.device) -> Tensor:
-    """Steps of the candidates."""
-    with torch.inference_mode(mode=False):
-        return torch.arange(first, end, stride, device=device)
+def _checked_horizon(
+    forecast: Tensor, target_pos: Tensor, tool_pos: Tensor | None, planned_steps: Tensor | None
+) -> int:
+    """F; raises `InputError` where a shape is wrong."""
+    check_trailing_shape("target_pos", target_pos, 3)
+    batch, horizon = target_pos.shape[:-1], forecast.shape[-2] if forecast.ndim > 1 else 1
+    check_trailing_shape("forecast", forecast, *batch, horizon, 3)
+    if tool_pos is not None:
+        check_trailing_shape("tool_pos", tool_pos, *batch, 3)
+    if planned_steps is not None:
+        check_trailing_shape("planned_steps", planned_steps, *batch)
+    return horizon
+
+
+def _best(score: Tensor, slack: Tensor, *, stay: Tensor, on_table: Tensor) -> tuple[Tensor, Tensor]:
+    """Index (*B, 1) of the candidate in time with the highest score, and whether any is in time (*B,); all (*B, K)."""
+    in_time = (slack >= 0.0) & (stay > 0) & on_table
+    nothing = ~in_time.any(dim=-1, keepdim=True)
+    # Worse and worse: late, out of the box's reach, never reached by the robot, below the table.
+    late = slack.clamp(min=-1e6) - 1e4 * (stay == 0) - 1e7 * ~on_table
+    score = torch.where(nothing, late, score.masked_fill(~in_time, -torch.inf))
+    return score.argmax(dim=-1, keepdim=True), ~nothing.squeeze(-1)

@@ -23,6 +23,8 @@ from torchdyn_plan.planners.search import SearchResult
 
 DROP_NAMES = ("outlook", "outlook_age", "drop_step", "tool_before")
 
+FOLLOW_AFTER = 2
+"""Control steps that a box goes straight down before it follows the target."""
 WAITING = ExactSearch(
     height=0.105, half_extent=0.722, lead=7.0, margin=15.0, footprint=0.055, longest_stay=12, patience=0.01,
     loyalty=8.0, arrived=0.015,
@@ -179,11 +181,16 @@ class MeetingPlanner(DynamicPlanner):
     def _goal(self, meeting: SearchResult, path: Tensor, tool_pos: Tensor, drop_step: Tensor) -> Tensor:
         """Above the meeting place, or down: first where the tool is, then after the target."""
         level = tool_pos[..., :2]
-        way = path[..., self.lead, :2] - level
-        length = way.square().sum(-1, keepdim=True).sqrt().clamp_min(1e-9)
-        follow = (drop_step >= 2).unsqueeze(-1)
-        down = level + torch.where(follow, way * (length.clamp_max(self.pull) / length), 0.0)
+        follow = (drop_step >= FOLLOW_AFTER).unsqueeze(-1)
+        down = torch.where(follow, pulled(level, path[..., self.lead, :2], self.pull), level)
         if self.search.half_extent is not None:
             down = down.clamp(-self.search.half_extent, self.search.half_extent)
         down = torch.cat([down, torch.full_like(down[..., :1], self.table_height)], dim=-1)
         return torch.where((drop_step >= 0).unsqueeze(-1), down, meeting.goal)
+
+
+def pulled(level: Tensor, place: Tensor, pull: float) -> Tensor:
+    """``place`` (*B, 2), or the point on the way there that is ``pull`` away from ``level`` (*B, 2) [m, world]."""
+    way = place - level
+    length = way.square().sum(-1, keepdim=True).sqrt().clamp_min(1e-9)
+    return level + way * (length.clamp_max(pull) / length)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from functools import lru_cache, partial
+from functools import partial
 from typing import TYPE_CHECKING, Literal, NamedTuple
 
 import torch
@@ -77,7 +77,7 @@ def search_corners(forecast: Tensor, target_pos: Tensor, eta: Callable[[Tensor],
     away = _at(path, steps) - path[..., :1, :]
     half_edge = torch.linalg.vector_norm(away, dim=-1, keepdim=True)
 
-    corners = torch.addcmul(path[..., :1, :], half_edge, _corners(path.device, path.dtype))
+    corners = torch.addcmul(path[..., :1, :], half_edge, path.new_tensor(CORNERS))
     arrival = eta(corners)
     steps, beyond = _on_path(arrival.steps, horizon)
     met = _at(path, steps)
@@ -90,13 +90,6 @@ def search_corners(forecast: Tensor, target_pos: Tensor, eta: Callable[[Tensor],
         clamped=(beyond.gather(-1, best) | beyond_here).squeeze(-1),
         reachable=~nowhere.squeeze(-1),
     )
-
-
-@lru_cache(maxsize=32)
-def _corners(device: torch.device, dtype: torch.dtype) -> Tensor:
-    """Corners of a square of half-edge one, ``(4, 3)``."""
-    with torch.inference_mode(mode=False):
-        return torch.tensor(CORNERS, device=device, dtype=dtype)
 
 
 def _on_path(steps: Tensor, horizon: int) -> tuple[Tensor, Tensor]:

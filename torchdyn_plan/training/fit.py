@@ -18,7 +18,7 @@ from torchdyn_plan.training.card import read_description, write_card
 from torchdyn_plan.training.lines import unfold_paths
 from torchdyn_plan.training.metrics import arrival_errors, arrival_groups, forecast_errors, pocket_accuracy
 from torchdyn_plan.training.optimise import Recipe, optimise
-from torchdyn_plan.training.windows import WindowConfig, Windows, draw_windows, last_useful_step, load_paths
+from torchdyn_plan.training.windows import Paths, WindowConfig, Windows, draw_windows, last_useful_step, load_paths
 
 SCORED = 4096
 """Held-out windows of each kind, or held-out samples, in one pass of validation."""
@@ -80,13 +80,7 @@ def fit_forecaster(
         episodes = train[torch.randint(len(train), (batch,), generator=generator)]
         return line_loss(network, draw_windows(paths, last, episodes, drawing, generator, lines=lines))
 
-    draws = torch.Generator().manual_seed(seed)
-    full = replace(drawing, first_step=drawing.history, early_share=0.0, shortened_share=0.0)
-    scored = [
-        draw_windows(paths, last, _some(held[last[held] >= kind.first_step], SCORED), kind, draws)
-        for kind in (full, replace(drawing, early_share=0.0, shortened_share=1.0))
-    ]
-    windows = Windows(*(torch.cat(tensors) for tensors in zip(*scored, strict=True)))
+    windows = _held_windows(paths, last, held, drawing, seed)
     settings = {"network": asdict(config), "scene": about["scene"], "episodes": len(paths.length)}
 
     def score() -> Tables:
@@ -100,6 +94,17 @@ def fit_forecaster(
     facts = {"data": about["arguments"], "scene": about["scene"]}
     facts |= {"episodes": len(paths.length), "held out": len(held), "network": asdict(config)}
     return _finish(network, folder, score, recipe, facts)
+
+
+def _held_windows(paths: Paths, last: Tensor, held: Tensor, drawing: WindowConfig, seed: int) -> Windows:
+    """`SCORED` windows with full histories and as many with padded ones, of the episodes ``held``."""
+    draws = torch.Generator().manual_seed(seed)
+    full = replace(drawing, first_step=drawing.history, early_share=0.0, shortened_share=0.0)
+    scored = [
+        draw_windows(paths, last, _some(held[last[held] >= kind.first_step], SCORED), kind, draws)
+        for kind in (full, replace(drawing, early_share=0.0, shortened_share=1.0))
+    ]
+    return Windows(*(torch.cat(tensors) for tensors in zip(*scored, strict=True)))
 
 
 def line_loss(network: Forecaster, windows: Windows) -> Tensor:
@@ -146,7 +151,7 @@ def fit_eta(
         seed: of initialisation, held-out runs and draws.
         device: where to train.
         resume: whether to continue from the checkpoint in ``out``.
-        config: of the network; the paper's for a UR5 by default.
+        config: of the network; for a UR5 by default.
         scene: that the data must come from.
 
     Returns:
