@@ -51,6 +51,12 @@ def train(arguments: TrainArguments) -> None:
     from torchdyn_plan.checks import check_writable_folder
 
     check_writable_folder(arguments.out)
+
+    if arguments.what == "policy":
+        from torchdyn_plan.training.policy import train_trapper
+
+        train_trapper(arguments)
+        return
     from torchdyn_plan.training import fit
 
     fits: dict[str, Callable[..., object]] = {"forecaster": fit.fit_forecaster, "eta": fit.fit_eta}

@@ -11,7 +11,7 @@ from torchdyn_plan.errors import InputError, UsageError
 PLANNERS = ("pursuit", "corner", "oracle", "exact", "meet")
 """Names of the planners for a moving target."""
 
-STATICS = ("ik",)
+STATICS = ("ik", "rl")
 """Names of the static planners."""
 
 SPLITS = ("test", "dev")
@@ -70,7 +70,7 @@ class EvaluateArguments:
     planners: tuple[str, ...] = PLANNERS
     """Planners for the moving target: pursuit, corner, oracle, exact, meet."""
     static: str = "ik"
-    """Static planner that drives the arm: ik."""
+    """Static planner that drives the arm: ik (inverse kinematics) or rl (a learned policy)."""
     velocity: float = 3.0
     """Velocity of the ball at the start [m/s]."""
     friction: float = 0.0
@@ -110,7 +110,7 @@ class SweepArguments:
     planners: tuple[str, ...] = PLANNERS
     """Planners for the moving target: pursuit, corner, oracle, exact, meet."""
     static: str = "ik"
-    """Static planner that drives the arm: ik."""
+    """Static planner that drives the arm: ik (inverse kinematics) or rl (a learned policy)."""
     velocity: float = 3.0
     """Velocity of the ball when friction varies [m/s]."""
     friction: float = 0.0
@@ -162,7 +162,9 @@ class CollectArguments:
     out: Path = Path("runs/data")
     """Folder for the shards of data."""
     static: str = "ik"
-    """Static planner whose arrivals are measured: ik."""
+    """Static planner whose arrivals are measured: ik or rl."""
+    weights: Path | None = None
+    """Policy of the static planner rl: a file, or a folder of its training; the one that ships when not given."""
     episodes: int = 20000
     """Number of balls rolled, or of sequences of runs of the static planner."""
     seed: int = 0
@@ -177,6 +179,8 @@ class CollectArguments:
 
         with _as_usage_error():
             check_choice("static planner", self.static, STATICS)
+            if self.weights is not None and (self.static, self.what) != ("rl", "arrivals"):
+                raise InputError(f"weights are of a policy: they go with arrivals of --static rl, got {self.static}")
             _check_counts(
                 episodes=(self.episodes, 1), seed=(self.seed, 0), num_envs=(self.num_envs, 1), threads=(self.threads, 0)
             )
@@ -184,16 +188,16 @@ class CollectArguments:
 
 @dataclass(frozen=True, kw_only=True)
 class TrainArguments:
-    """Fit a network to collected data; a killed run continues where its folder stands."""
+    """Train a network, on collected data or by trial; a killed run continues where its folder stands."""
 
-    what: Literal["forecaster", "eta"]
-    """Which network: forecaster (paths of the ball) or eta (arrival times of the arm)."""
+    what: Literal["forecaster", "eta", "policy"]
+    """Which network: forecaster (paths of the ball), eta (arrival times of the arm) or policy (by DDPG and HER)."""
     data: Path = Path("runs/data")
-    """Folder of the collected shards."""
+    """Folder of the collected shards; a policy needs none."""
     out: Path = Path("runs/training")
     """Folder for checkpoints, the curve and the weights, one for each network."""
     steps: int | None = None
-    """Optimiser steps; the recipe's own when not given."""
+    """Optimiser steps (of a policy: rounds); the recipe's own when not given."""
     batch: int | None = None
     """Samples a step; the recipe's own when not given."""
     lr: float | None = None
@@ -204,12 +208,21 @@ class TrainArguments:
     """Where to train: cpu, cuda, cuda:1, …"""
     resume: bool = True
     """Continue from the checkpoint in the folder, if there is one."""
+    num_envs: int | None = None
+    """Of a policy: episodes that run side by side; the recipe's own when not given."""
+    period: int = 5
+    """Of a policy: control steps for which an action holds while it learns."""
+    threads: int = 0
+    """Of a policy: threads of the simulation, 0 for all cores; does not change the result."""
 
     def __post_init__(self) -> None:
         from torchdyn_plan.checks import check_number
 
         with _as_usage_error():
-            _check_counts(steps=(self.steps, 1), batch=(self.batch, 1), seed=(self.seed, 0))
+            _check_counts(
+                steps=(self.steps, 1), batch=(self.batch, 1), seed=(self.seed, 0), num_envs=(self.num_envs, 1),
+                period=(self.period, 1), threads=(self.threads, 0),
+            )  # fmt: skip
             if self.lr is not None:
                 check_number("lr", self.lr, minimum=1e-9)
 

@@ -5,6 +5,7 @@ from dataclasses import dataclass
 JOINT_POS = "joint_pos"
 JOINT_VEL = "joint_vel"
 TOOL_POS = "tool_pos"
+TOOL_ROTATION = "tool_rotation"
 TARGET_POS = "target_pos"
 TARGET_HISTORY = "target_history"
 HISTORY_LENGTH = "history_length"
@@ -38,6 +39,7 @@ KEYS: tuple[Key, ...] = (
     Key(name=JOINT_POS, shape=("N",), meaning="joint angles [rad]", writer="env"),
     Key(name=JOINT_VEL, shape=("N",), meaning="joint speeds [rad/s]", writer="env"),
     Key(name=TOOL_POS, shape=(3,), meaning="centre of the box mouth [m, world]", writer="env"),
+    Key(name=TOOL_ROTATION, shape=(3, 3), meaning="the box's axes in the world, as columns", writer="goal env"),
     Key(name=TARGET_POS, shape=(3,), meaning="centre of the target [m, world]", writer="env"),
     Key(name=TARGET_HISTORY, shape=("H", 3), meaning="target positions, oldest first [m, world]", writer="env"),
     Key(name=HISTORY_LENGTH, shape=(), meaning="samples in the history that are no padding", writer="env"),

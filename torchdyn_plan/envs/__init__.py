@@ -1,7 +1,8 @@
 """Simulated tasks: MuJoCo scenes, batched simulation, TorchRL environments."""
 
+from torchdyn_plan.envs.goals import TrapperGoalEnv
 from torchdyn_plan.envs.scene import TrapperScene
 from torchdyn_plan.envs.simulation import TrapperSimulation
 from torchdyn_plan.envs.trapper import TrapperEnv
 
-__all__ = ["TrapperEnv", "TrapperScene", "TrapperSimulation"]
+__all__ = ["TrapperEnv", "TrapperGoalEnv", "TrapperScene", "TrapperSimulation"]

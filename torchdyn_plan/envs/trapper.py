@@ -115,6 +115,11 @@ class TrapperEnv(EnvBase):
         check_number("episode", episode, minimum=0, integer=True)
         self._next_episode = episode
 
+    @property
+    def next_episode(self) -> int:
+        """Number of the episode that the next reset takes."""
+        return self._next_episode
+
     def _set_seed(self, seed: int | None) -> None:
         """Start the series ``seed`` at its first episode."""
         self.seed, self._next_episode = seed or 0, 0

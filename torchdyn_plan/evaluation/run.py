@@ -10,6 +10,7 @@ from pathlib import Path
 
 import torch
 from tensordict import TensorDict, TensorDictBase
+from tensordict.nn import TensorDictModuleBase
 from torch import Tensor
 
 from torchdyn_plan import keys
@@ -26,7 +27,6 @@ from torchdyn_plan.planners import (
     STATIC_PLANNERS,
     DynamicPlanner,
     ExactSearch,
-    IKPlanner,
     MeetingPlanner,
     OracleTrajectory,
     TargetPursuit,
@@ -52,7 +52,7 @@ PLANNERS: dict[str, Callable[[str], Planner]] = {
 """The planners for a moving target by name, on the static planner of a given name."""
 
 
-def static_planner(name: str) -> IKPlanner:
+def static_planner(name: str) -> TensorDictModuleBase:
     """The static planner of that name, whose results do not depend on the number of environments."""
     return STATIC_PLANNERS[name](chunk=IK_CHUNK)
 

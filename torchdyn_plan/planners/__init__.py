@@ -7,6 +7,7 @@ from torchdyn_plan.planners.dynamic import STATIC_PLANNERS, DynamicPlanner
 from torchdyn_plan.planners.exact import ExactSearch
 from torchdyn_plan.planners.ik import IKPlanner
 from torchdyn_plan.planners.meeting import MeetingPlanner
+from torchdyn_plan.planners.policy import PolicyPlanner
 from torchdyn_plan.planners.protocol import StaticPlanner
 from torchdyn_plan.planners.schedule import ReplanSchedule
 from torchdyn_plan.planners.search import CornerSearch, SearchResult, search_corners
@@ -21,6 +22,7 @@ __all__ = [
     "IKPlanner",
     "MeetingPlanner",
     "OracleTrajectory",
+    "PolicyPlanner",
     "ReplanSchedule",
     "SearchResult",
     "StaticPlanner",

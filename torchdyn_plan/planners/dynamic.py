@@ -14,15 +14,19 @@ from torchdyn_plan import keys
 from torchdyn_plan.checks import check_choice, check_finite, check_number, check_same_device, check_trailing_shape
 from torchdyn_plan.planners.ik import IKPlanner
 from torchdyn_plan.planners.memory import MEMORY_KEYS, carry_on, recall, remember
+from torchdyn_plan.planners.policy import PolicyPlanner
 from torchdyn_plan.planners.protocol import ArrivalPredictor, GoalSearch, StaticPlanner, keys_read, keys_written, read
 from torchdyn_plan.planners.rows import apply_to_rows
 from torchdyn_plan.planners.schedule import ReplanSchedule
 from torchdyn_plan.planners.search import CornerSearch, SearchResult
 
-STATIC_PLANNERS = {"ik": IKPlanner}
-"""The static planners that ship, by name."""
-PRETRAINED = {"trapper-ik": (IKPlanner, "trapper", "trapper-ik")}
-"""Name → class of the static planner, name of the forecaster's weights, name of the ETA network's weights."""
+STATIC_PLANNERS: dict[str, Callable[..., TensorDictModuleBase]] = {
+    "ik": IKPlanner,
+    "rl": partial(PolicyPlanner.from_pretrained, "trapper"),
+}
+"""What makes the static planners that ship, by name; each takes ``chunk``."""
+PRETRAINED = {f"trapper-{name}": (name, "trapper", f"trapper-{name}") for name in STATIC_PLANNERS}
+"""Name → names of the static planner, of the forecaster's weights, and of the ETA network's weights."""
 
 
 class DynamicPlanner(TensorDictModuleBase):
@@ -109,7 +113,7 @@ class DynamicPlanner(TensorDictModuleBase):
 
     @classmethod
     def from_pretrained(cls, name: str, *, chunk: int | None = None) -> DynamicPlanner:
-        """A planner with the weights that ship with the package: ``"trapper-ik"``.
+        """A planner with the weights that ship with the package: ``"trapper-ik"`` or ``"trapper-rl"``.
 
         Raises:
             InputError: there is no planner of that name; the message lists those there are.
@@ -119,5 +123,5 @@ class DynamicPlanner(TensorDictModuleBase):
         from torchdyn_plan.nets import ETANetwork, Forecaster
 
         static, forecaster, eta = PRETRAINED[name]
-        parts = static(chunk=chunk), Forecaster.from_pretrained(forecaster), ETANetwork.from_pretrained(eta)
+        parts = STATIC_PLANNERS[static](chunk=chunk), Forecaster.from_pretrained(forecaster), ETANetwork.from_pretrained(eta)
         return cls(*parts, chunk=chunk).eval().requires_grad_(False)

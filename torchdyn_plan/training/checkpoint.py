@@ -37,8 +37,14 @@ def save_checkpoint(
     tensors = {f"network.{name}": value for name, value in network.state_dict().items()}
     for index, state in optimiser.state_dict()["state"].items():
         tensors |= {f"optimiser.{index}.{name}": value for name, value in state.items()}
+    write_checkpoint(file, tensors | {"generator": generator.get_state()}, settings=settings, progress=progress)
+
+
+def write_checkpoint(
+    file: Path, tensors: dict[str, Tensor], *, settings: dict[str, Any], progress: dict[str, Any]
+) -> None:
+    """Write ``tensors``, JSON ``settings`` and JSON ``progress`` to ``file``, whole or not at all."""
     tensors = {name: value.detach().cpu().contiguous() for name, value in tensors.items()}
-    tensors["generator"] = generator.get_state()
     metadata = {"format": FORMAT, "settings": json.dumps(settings), "progress": json.dumps(progress)}
     write_whole(file, lambda temporary: save_file(tensors, temporary, metadata))
 
@@ -56,22 +62,33 @@ def load_checkpoint(
     Raises:
         TrainingError: the file is damaged, or was made with other ``settings``, of which the first is named.
     """
-    metadata, tensors = _read(file)
+    tensors, progress = read_checkpoint(file, settings=settings)
     try:
-        found, progress = json.loads(metadata["settings"]), json.loads(metadata["progress"])
-        _check_settings(file, settings, found)
-        network.load_state_dict(_group(tensors, "network"))
+        network.load_state_dict(group(tensors, "network"))
         states: dict[int, dict[str, Tensor]] = {}
-        for name, value in _group(tensors, "optimiser").items():
+        for name, value in group(tensors, "optimiser").items():
             index, _, entry = name.partition(".")
             states.setdefault(int(index), {})[entry] = value
         optimiser.load_state_dict({"state": states, "param_groups": optimiser.state_dict()["param_groups"]})
         generator.set_state(tensors["generator"])
-    except TrainingError:
-        raise
     except (KeyError, ValueError, RuntimeError) as error:
         raise TrainingError(f"checkpoint {str(file)!r} does not fit this network: {error}") from error
     return progress
+
+
+def read_checkpoint(file: Path, *, settings: dict[str, Any]) -> tuple[dict[str, Tensor], dict[str, Any]]:
+    """Tensors and progress in ``file``.
+
+    Raises:
+        TrainingError: the file is damaged, or was made with other ``settings``, of which the first is named.
+    """
+    metadata, tensors = _read(file)
+    try:
+        found, progress = json.loads(metadata["settings"]), json.loads(metadata["progress"])
+    except (KeyError, ValueError) as error:
+        raise TrainingError(f"checkpoint {str(file)!r} does not tell how it was made: {error}") from error
+    _check_settings(file, settings, found)
+    return tensors, progress
 
 
 def _read(file: Path) -> tuple[dict[str, str], dict[str, Tensor]]:
@@ -88,7 +105,8 @@ def _read(file: Path) -> tuple[dict[str, str], dict[str, Tensor]]:
     return metadata, tensors
 
 
-def _group(tensors: dict[str, Tensor], prefix: str) -> dict[str, Tensor]:
+def group(tensors: dict[str, Tensor], prefix: str) -> dict[str, Tensor]:
+    """Those of ``tensors`` whose names begin with ``prefix`` and a dot, without them."""
     return {name.removeprefix(f"{prefix}."): value for name, value in tensors.items() if name.startswith(f"{prefix}.")}
 
 

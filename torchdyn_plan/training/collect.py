@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import hashlib
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -20,7 +21,7 @@ from torchdyn_plan.envs.simulation import TrapperSimulation
 from torchdyn_plan.envs.trapping import is_pocketed
 from torchdyn_plan.errors import InputError
 from torchdyn_plan.files import write_json, write_whole
-from torchdyn_plan.planners import STATIC_PLANNERS
+from torchdyn_plan.planners import STATIC_PLANNERS, PolicyPlanner
 from torchdyn_plan.training.runs import record_runs
 from torchdyn_plan.versions import library_versions
 
@@ -67,7 +68,10 @@ def _made(arguments: CollectArguments, scene: TrapperScene, index: int) -> dict[
     """What decides a shard's numbers: its metadata."""
     episodes = sum(map(len, _shard_rows(arguments, index)))
     shared = {"scene": scene.digest(), "num_envs": str(arguments.num_envs), "episodes": str(episodes)}
-    return shared | ({"static": arguments.static} if arguments.what == "arrivals" else {})
+    if arguments.what == "paths":
+        return shared
+    weights = {} if arguments.weights is None else {"weights": _digest(policy_file(arguments.weights))}
+    return shared | {"static": arguments.static} | weights
 
 
 def _is_kept(path: Path, made: dict[str, str]) -> bool:
@@ -123,11 +127,26 @@ def _flatten(paths: Tensor, speeds: Tensor, scene: TrapperScene) -> dict[str, Te
     return {"positions": paths[kept], "start": start, "length": length, "pocketed": pocketed, "velocity": speeds}
 
 
+def policy_file(weights: Path) -> Path:
+    """File of the policy that is a file, or lies in a folder of its training; raises `InputError` if there is none."""
+    choices = (weights, weights / "policy.safetensors", weights / "policy" / "policy.safetensors")
+    for choice in choices:
+        if choice.is_file():
+            return choice
+    raise InputError(f"no policy at {str(weights)!r}: it is neither a file nor a folder of a training")
+
+
+def _digest(file: Path) -> str:
+    return hashlib.sha256(file.read_bytes()).hexdigest()[:16]
+
+
 def _arrivals(arguments: CollectArguments, scene: TrapperScene, index: int) -> dict[str, Tensor]:
     """Runs of the static planner, whole sequences of every arm."""
-    task = ReachingTask(
-        STATIC_PLANNERS[arguments.static](), arguments.num_envs, scene=scene, num_threads=arguments.threads
-    )
+    if arguments.weights is None:
+        planner = STATIC_PLANNERS[arguments.static]()
+    else:
+        planner = PolicyPlanner.from_pretrained(policy_file(arguments.weights))
+    task = ReachingTask(planner, arguments.num_envs, scene=scene, num_threads=arguments.threads)
     draw = torch.Generator().manual_seed(arguments.seed * 1_000_003 + index)
     parts = [record_runs(task, draw) for _ in _shard_rows(arguments, index)]
     return {name: torch.cat([part[name] for part in parts]) for name in parts[0]}

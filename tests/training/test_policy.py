@@ -1,0 +1,156 @@
+"""DDPG with hindsight: it learns, resumes exactly, keeps the best, and refuses what does not fit."""
+
+import csv
+import os
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import pytest
+import torch
+from torchdyn_plan.errors import InputError, TrainingError
+from torchdyn_plan.nets.policy import Actor
+from torchdyn_plan.training.ddpg import DDPG, DDPGRecipe
+from torchdyn_plan.training.policy import fit_policy
+
+from tests.training.points import PointTask
+
+RECIPE = DDPGRecipe(iterations=12, num_envs=8, updates=20, batch=64, capacity=500, warmup=2, gamma=0.9)
+
+
+class Cut(Exception):
+    """A stand-in for a crash."""
+
+
+class CutTask(PointTask):
+    """Crashes at its n-th score."""
+
+    def __init__(self, scores: int) -> None:
+        self.left = scores
+
+    def score(self, actor: Actor) -> dict[str, float]:
+        self.left -= 1
+        if self.left < 0:
+            raise Cut
+        return super().score(actor)
+
+
+def weights(folder: Path) -> dict[str, torch.Tensor]:
+    return Actor.from_pretrained(folder / "policy").state_dict()
+
+
+def test_learns_to_reach(tmp_path: Path) -> None:
+    recipe = DDPGRecipe(iterations=30, num_envs=16, updates=30, batch=128, capacity=20_000, warmup=2, gamma=0.9)
+    fit_policy(PointTask(), tmp_path, recipe=recipe, score_every=10)
+    with (tmp_path / "policy" / "curve.csv").open() as file:
+        rows = list(csv.DictReader(file))
+    assert [row["round"] for row in rows] == ["10", "20", "30"]
+    assert float(rows[-1]["success"]) > 0.9
+    untrained = PointTask().score(Actor(PointTask.policy_config))["success"]
+    assert untrained < 0.3
+    assert "success" in (tmp_path / "policy" / "policy.md").read_text()
+
+
+def test_interrupted_training_ends_where_an_undisturbed_one_does(tmp_path: Path) -> None:
+    fit_policy(PointTask(), tmp_path / "whole", recipe=RECIPE, score_every=2)
+    for scores in (1, 2):
+        with pytest.raises(Cut):
+            fit_policy(CutTask(scores), tmp_path / "cut", recipe=RECIPE, score_every=2)
+    fit_policy(PointTask(), tmp_path / "cut", recipe=RECIPE, score_every=2)
+    whole, cut = weights(tmp_path / "whole"), weights(tmp_path / "cut")
+    assert all(torch.equal(value, cut[name]) for name, value in whole.items())
+    curves = []
+    for folder in ("whole", "cut"):
+        with (tmp_path / folder / "policy" / "curve.csv").open() as file:
+            curves.append([{k: v for k, v in row.items() if k != "seconds"} for row in csv.DictReader(file)])
+    assert curves[0] == curves[1]
+
+
+def test_killed_training_resumes(tmp_path: Path) -> None:
+    """A real process, killed with SIGKILL when it has written a checkpoint, leaves a folder that goes on exactly."""
+    fit_policy(PointTask(), tmp_path / "whole", recipe=RECIPE, score_every=2)
+    code = (
+        "from pathlib import Path; import sys; sys.path.insert(0, sys.argv[2])\n"
+        "from tests.training.points import PointTask; from tests.training.test_policy import RECIPE\n"
+        "from torchdyn_plan.training.policy import fit_policy\n"
+        "fit_policy(PointTask(), Path(sys.argv[1]), recipe=RECIPE, score_every=2)"
+    )
+    words = [sys.executable, "-c", code, str(tmp_path / "killed"), str(Path(__file__).parents[2])]
+    process = subprocess.Popen(words, stderr=subprocess.DEVNULL)
+    checkpoint = tmp_path / "killed" / "policy" / "checkpoint.safetensors"
+    deadline = time.monotonic() + 120
+    while not checkpoint.exists() and process.poll() is None and time.monotonic() < deadline:
+        time.sleep(0.01)
+    os.kill(process.pid, signal.SIGKILL)
+    process.wait()
+    assert checkpoint.exists()
+    fit_policy(PointTask(), tmp_path / "killed", recipe=RECIPE, score_every=2)
+    whole, killed = weights(tmp_path / "whole"), weights(tmp_path / "killed")
+    assert all(torch.equal(value, killed[name]) for name, value in whole.items())
+
+
+def test_the_best_policy_is_kept(tmp_path: Path) -> None:
+    class Worse(PointTask):
+        scores = iter([0.5, 0.9, 0.2, 0.1, 0.9, 0.3])
+
+        def score(self, actor: Actor) -> dict[str, float]:
+            kept.append({name: value.clone() for name, value in actor.state_dict().items()})
+            return {"success": next(self.scores), "steps": 0.0}
+
+    kept: list[dict[str, torch.Tensor]] = []
+    fit_policy(Worse(), tmp_path, recipe=RECIPE, score_every=2)
+    best = weights(tmp_path)
+    assert all(torch.equal(value, best[name]) for name, value in kept[4].items())
+
+
+def test_nan_stops_and_leaves_the_last_checkpoint(tmp_path: Path) -> None:
+    class Broken(PointTask):
+        rounds = 0
+
+        def reward(self, transitions: object) -> torch.Tensor:
+            value = super().reward(transitions)
+            Broken.rounds += 1
+            return value * float("nan") if Broken.rounds > 100 else value
+
+    with pytest.raises(TrainingError, match=r"round 8, update 1: loss of the actor .*critic nan.*checkpoint is kept"):
+        fit_policy(Broken(), tmp_path, recipe=RECIPE, score_every=2)
+    fit_policy(PointTask(), tmp_path, recipe=RECIPE, score_every=2)
+
+
+def test_refuses_another_configuration_before_anything_is_written(tmp_path: Path) -> None:
+    short = DDPGRecipe(iterations=2, num_envs=8, updates=2, batch=64, capacity=500, warmup=1, gamma=0.9)
+    fit_policy(PointTask(), tmp_path, recipe=short, score_every=1)
+    before = {file: file.stat().st_mtime_ns for file in (tmp_path / "policy").iterdir()}
+    other = DDPGRecipe(iterations=2, num_envs=8, updates=2, batch=32, capacity=500, warmup=1, gamma=0.9)
+    with pytest.raises(TrainingError, match=r"made with recipe .*'batch': 64"):
+        fit_policy(PointTask(), tmp_path, recipe=other, score_every=1)
+
+    class Other(PointTask):
+        def settings(self) -> dict[str, str]:
+            return {"task": "squares"}
+
+    with pytest.raises(TrainingError, match="made with task 'points', not 'squares'"):
+        fit_policy(Other(), tmp_path, recipe=short, score_every=1)
+    assert before == {file: file.stat().st_mtime_ns for file in (tmp_path / "policy").iterdir()}
+
+
+@pytest.mark.parametrize(("name", "value"), [("num_envs", 0), ("gamma", 1.5), ("noise", -0.1), ("lr_actor", 0.0)])
+def test_refuses_impossible_recipes(name: str, value: float) -> None:
+    with pytest.raises(InputError, match=name):
+        DDPGRecipe(**{name: value})
+
+
+def test_targets_follow_and_statistics_reach_every_network() -> None:
+    ddpg = DDPG(PointTask(), RECIPE)
+    for _ in range(3):
+        ddpg.iterate()
+    shift = ddpg.actor.features.shift
+    assert shift.abs().sum() > 0
+    assert torch.equal(ddpg.critic.features.shift, shift)
+    for parameters in (ddpg.loss.target_actor_network_params, ddpg.loss.target_value_network_params):
+        assert torch.equal(parameters["module", "features", "shift"].data, shift)
+    target = ddpg.loss.target_actor_network_params["module", "body", "0", "weight"].data
+    online = ddpg.actor.body[0].weight
+    assert 0 < (target - online).abs().max() < 0.1

@@ -1,0 +1,147 @@
+"""A goal-conditioned policy and its critic: robot state and goal to an action, and to what that action is worth."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import torch
+from torch import Tensor, nn
+
+from torchdyn_plan.checks import check_finite, check_number, check_same_device, check_trailing_shape
+from torchdyn_plan.errors import InputError
+from torchdyn_plan.nets.pretrained import Pretrained
+
+GOAL_FEATURES = 11
+"""Goal, offset from the tool, the same squashed near the goal, level and full distance."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class PolicyConfig:
+    """Sizes of an `Actor` and its `Critic`; for Trapper's UR5 by default."""
+
+    robot_state_size: int = 15
+    """Size S of the robot state."""
+    tool_slice: tuple[int, int] = (12, 15)
+    """First and one-past-last entry of the robot state that hold the tool position."""
+    action_size: int = 6
+    """Size A of an action."""
+    hidden: int = 256
+    """Width of the hidden layers."""
+    layers: int = 3
+    """Number of hidden layers."""
+    near: float = 0.05
+    """Distance from the goal within which offsets are told apart finely [m]."""
+
+    def __post_init__(self) -> None:
+        for name in ("robot_state_size", "action_size", "hidden", "layers"):
+            check_number(name, getattr(self, name), minimum=1, integer=True)
+        check_number("near", self.near, minimum=1e-6)
+        object.__setattr__(self, "tool_slice", tuple(self.tool_slice))
+        first, last = self.tool_slice
+        if not 0 <= first < last <= self.robot_state_size or last - first != 3:
+            raise InputError(
+                f"tool_slice must span 3 entries of a robot state of {self.robot_state_size}, got {self.tool_slice}"
+            )
+
+
+class GoalFeatures(nn.Module):
+    """What actor and critic see of a robot state and a goal: standardised by buffers, all of about unit size."""
+
+    shift: Tensor
+    scale: Tensor
+
+    def __init__(self, config: PolicyConfig) -> None:
+        """Buffers that leave inputs as they are, until `set_statistics` fills them."""
+        super().__init__()
+        self.tool, self.size = slice(*config.tool_slice), config.robot_state_size + GOAL_FEATURES
+        self.sharpness = 1.0 / config.near
+        self.register_buffer("shift", torch.zeros(self.size))
+        self.register_buffer("scale", torch.ones(self.size))
+
+    def forward(self, robot_state: Tensor, goal: Tensor) -> Tensor:
+        """Features ``(*B, S + 11)`` of robot states ``(*B, S)`` and goals ``(*B, 3)`` [m, world]."""
+        return torch.addcmul(self.shift, self.raw(robot_state, goal), self.scale)
+
+    def raw(self, robot_state: Tensor, goal: Tensor) -> Tensor:
+        """The same, not yet standardised."""
+        offset = goal - robot_state[..., self.tool]
+        square = offset.square()
+        level = square[..., :2].sum(-1, keepdim=True)
+        distance = (torch.cat([level, level + square[..., 2:]], dim=-1) + 1e-12).sqrt()
+        return torch.cat([robot_state, goal, offset, torch.tanh(offset * self.sharpness), distance], dim=-1)
+
+    @torch.no_grad()
+    def set_statistics(self, robot_state: Tensor, goal: Tensor) -> None:
+        """Standardise by mean and deviation of the samples ``robot_state`` (n, S) and ``goal`` (n, 3)."""
+        features = self.raw(robot_state, goal)
+        scale = 1.0 / features.std(dim=0).clamp(min=1e-2)
+        self.scale.copy_(scale)
+        self.shift.copy_(-features.mean(dim=0) * scale)
+
+
+class Actor(Pretrained, nn.Module):
+    """Deterministic policy π(s, g): fully connected with ReLU, squashed by tanh to actions within ±1."""
+
+    kind = "policy"
+    config_type = PolicyConfig
+
+    def __init__(self, config: PolicyConfig | None = None, **settings: Any) -> None:
+        """Build the network from ``config``, or from the fields of `PolicyConfig` given as keywords."""
+        super().__init__()
+        self.config = config = config or PolicyConfig(**settings)
+        self.features = GoalFeatures(config)
+        self.body = _perceptron(self.features.size, config, config.action_size, normalised=False)
+        # Small first actions: a tanh that starts saturated hardly learns.
+        final = self.body[-1]
+        assert isinstance(final, nn.Linear)
+        nn.init.uniform_(final.weight, -3e-3, 3e-3)
+        nn.init.zeros_(final.bias)
+
+    def forward(self, robot_state: Tensor, goal: Tensor) -> Tensor:
+        """Action.
+
+        Args:
+            robot_state: ``(*B, S)``.
+            goal: ``(*B, 3)`` place to reach [m, world].
+
+        Returns:
+            ``(*B, A)`` within ±1.
+
+        Raises:
+            InputError: a trailing shape or a device is wrong, or an input holds a NaN.
+        """
+        if not torch.compiler.is_compiling():
+            self._check(robot_state, goal)
+        return torch.tanh(self.body(self.features(robot_state, goal)))
+
+    def _check(self, robot_state: Tensor, goal: Tensor) -> None:
+        device = self.features.scale.device
+        for name, tensor, size in (("robot_state", robot_state, self.config.robot_state_size), ("goal", goal, 3)):
+            check_trailing_shape(name, tensor, size)
+            check_same_device(name, tensor, device, type(self).__name__)
+            check_finite(name, tensor)
+
+
+class Critic(nn.Module):
+    """Action value Q(s, g, a): fully connected, layer-normalised so that it cannot run away, with ReLU."""
+
+    def __init__(self, config: PolicyConfig) -> None:
+        """Build the network from ``config``."""
+        super().__init__()
+        self.config = config
+        self.features = GoalFeatures(config)
+        self.body = _perceptron(self.features.size + config.action_size, config, 1, normalised=True)
+
+    def forward(self, robot_state: Tensor, goal: Tensor, action: Tensor) -> Tensor:
+        """Value ``(*B, 1)`` of ``action`` (*B, A) for a robot state (*B, S) and a goal (*B, 3) [m, world]."""
+        return self.body(torch.cat([self.features(robot_state, goal), action], dim=-1))
+
+
+def _perceptron(inputs: int, config: PolicyConfig, outputs: int, *, normalised: bool) -> nn.Sequential:
+    layers: list[nn.Module] = []
+    width = inputs
+    for _ in range(config.layers):
+        layers += [nn.Linear(width, config.hidden), *([nn.LayerNorm(config.hidden)] if normalised else []), nn.ReLU()]
+        width = config.hidden
+    return nn.Sequential(*layers, nn.Linear(width, outputs))

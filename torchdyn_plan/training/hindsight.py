@@ -1,0 +1,103 @@
+"""Hindsight experience replay over whole episodes laid end to end."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+
+import torch
+from tensordict import TensorDict, TensorDictBase
+from torch import Tensor
+from torchrl.data import HERReplayBuffer, LazyTensorStorage
+from torchrl.data.replay_buffers.storages import Storage
+
+from torchdyn_plan import keys
+from torchdyn_plan.errors import InputError
+
+NEXT_ACHIEVED = ("next", keys.ACHIEVED_GOAL)
+
+
+class HindsightReplayBuffer(HERReplayBuffer):
+    """TorchRL's `HERReplayBuffer` for episodes of one length, strategy *future*.
+
+    Replaces of the upstream: the key of its cache of episode ends (it holds a tensor, and comparing two of them raises
+    once the storage is full) and the ends themselves (past the wrap they leave out the last one, so that a goal may
+    come from another episode). Here every episode is ``length`` long and the capacity a multiple of it, so that the
+    ends are arithmetic. After relabelling, ``next`` has the goal of the transition: a goal that changed in between is
+    no part of what the transition teaches.
+    """
+
+    def __init__(
+        self,
+        reward_fn: Callable[[TensorDictBase], Tensor],
+        *,
+        capacity: int,
+        length: int,
+        batch_size: int,
+        her_ratio: float = 0.8,
+    ) -> None:
+        """An empty buffer.
+
+        Args:
+            reward_fn: maps transitions with the goal already replaced to rewards ``(B, 1)``.
+            capacity: transitions kept, at least one episode; rounded down to whole episodes.
+            length: transitions in an episode.
+            batch_size: transitions of a sample.
+            her_ratio: share of a sample that is relabelled: its first rows.
+
+        Raises:
+            InputError: ``capacity`` holds no episode.
+        """
+        if capacity < length:
+            raise InputError(f"capacity must hold an episode of {length} transitions, got {capacity}")
+        super().__init__(
+            reward_fn,
+            her_ratio=her_ratio,
+            strategy="future",
+            achieved_goal_key=NEXT_ACHIEVED,
+            storage=LazyTensorStorage(capacity - capacity % length),
+            batch_size=batch_size,
+        )
+        self.length = length
+
+    def extend_episodes(self, episodes: TensorDictBase) -> None:
+        """Add whole ``episodes``, batch ``(N, length)``."""
+        if episodes.batch_size[-1] != self.length:
+            raise InputError(f"episodes must have {self.length} transitions, got {episodes.batch_size[-1]}")
+        self.extend(episodes.reshape(-1))
+
+    def _get_episode_ends(self, storage: Storage) -> Tensor:
+        return torch.arange(self.length - 1, len(storage), self.length)
+
+    def _get_episode_range(self, idx: Tensor, episode_ends: Tensor) -> tuple[Tensor, Tensor]:
+        start = idx - idx % self.length
+        return start, start + (self.length - 1)
+
+    def _sample_goal_indices(self, her_idx: Tensor, ep_starts: Tensor, ep_ends: Tensor, storage_len: int) -> Tensor:
+        span = (ep_ends - her_idx + 1).float()
+        return her_idx + (torch.rand(len(her_idx)) * span).long().clamp(max=ep_ends - her_idx)
+
+    def _sample(self, batch_size: int) -> tuple[Any, dict[str, Any]]:
+        data, info = super()._sample(batch_size)
+        data.set(("next", keys.DESIRED_GOAL), data.get(keys.DESIRED_GOAL))
+        return data, info
+
+    def tensors(self) -> dict[str, Tensor]:
+        """What is stored, by flat names, in the order of storage."""
+        stored = self._storage[: len(self)]
+        return {".".join(key) if isinstance(key, tuple) else key: value for key, value in stored.items(True, True)}
+
+    def restore(self, tensors: dict[str, Tensor], cursor: int) -> None:
+        """Fill an empty buffer with what `tensors` gave, the next episode going to ``cursor``."""
+        nested = {tuple(name.split(".")): value for name, value in tensors.items()}
+        count = len(next(iter(nested.values())))
+        entries = TensorDict({}, batch_size=[count])
+        for name, value in nested.items():
+            entries.set(name, value)
+        self.extend(entries)
+        self._writer._cursor = cursor
+
+    @property
+    def cursor(self) -> int:
+        """Where the next episode goes."""
+        return int(self._writer._cursor)

@@ -1,0 +1,175 @@
+"""The training of a policy: rounds of DDPG, scored, logged and kept, that goes on exactly where it was cut off."""
+
+from __future__ import annotations
+
+import csv
+import io
+import json
+import time
+from dataclasses import asdict
+from pathlib import Path
+from typing import Any
+
+import torch
+
+from torchdyn_plan.checks import check_number
+from torchdyn_plan.cli_arguments import TrainArguments
+from torchdyn_plan.files import write_whole
+from torchdyn_plan.nets.policy import Actor
+from torchdyn_plan.training.card import write_card
+from torchdyn_plan.training.checkpoint import group, read_checkpoint, write_checkpoint
+from torchdyn_plan.training.ddpg import DDPG, DDPGRecipe, GoalTask
+
+
+def train_trapper(arguments: TrainArguments) -> Path:
+    """Train Trapper's policy as the command line says; returns the weights' file."""
+    from torchdyn_plan.training.trapper_task import TrapperTask
+
+    given = {"iterations": arguments.steps, "batch": arguments.batch, "num_envs": arguments.num_envs}
+    if arguments.lr is not None:
+        given |= {"lr_critic": arguments.lr, "lr_actor": arguments.lr / 2}
+    recipe = DDPGRecipe(seed=arguments.seed, **{name: value for name, value in given.items() if value is not None})
+    task = TrapperTask(period=arguments.period, num_threads=arguments.threads)
+    return fit_policy(task, arguments.out, recipe=recipe, resume=arguments.resume)
+
+
+def fit_policy(
+    task: GoalTask,
+    out: Path,
+    *,
+    recipe: DDPGRecipe | None = None,
+    resume: bool = True,
+    score_every: int = 20,
+    checkpoint_seconds: float = 60.0,
+) -> Path:
+    """Train a policy for ``task`` by `DDPG`; the best that was scored is kept.
+
+    Killed at any moment and resumed, it ends where it would have without: rounds are whole episodes of every
+    environment, and networks, optimisers, replay, counters and random states are in the checkpoint.
+
+    Args:
+        task: goals, rewards and score.
+        out: gets a folder ``policy`` with checkpoint, ``curve.csv``, TensorBoard's files, weights and card.
+        recipe: rounds, rates and seed.
+        resume: whether to continue from the checkpoint in ``out``.
+        score_every: rounds from one score to the next.
+        checkpoint_seconds: time between checkpoints [s].
+
+    Returns:
+        The weights' file.
+
+    Raises:
+        TrainingError: a loss is NaN, or the checkpoint is damaged, of another task, or has other settings.
+    """
+    check_number("score_every", score_every, minimum=1, integer=True)
+    threads = torch.get_num_threads()
+    torch.set_num_threads(1)
+    try:
+        return _Training(task, out / Actor.kind, recipe or DDPGRecipe(), score_every).run(resume, checkpoint_seconds)
+    finally:
+        torch.set_num_threads(threads)
+
+
+class _Training:
+    def __init__(self, task: GoalTask, folder: Path, recipe: DDPGRecipe, score_every: int) -> None:
+        self.task, self.folder, self.recipe, self.score_every = task, folder, recipe, score_every
+        self.file, self.weights = folder / "checkpoint.safetensors", folder / f"{Actor.kind}.safetensors"
+        self.settings = task.settings() | {"recipe": asdict(recipe), "score_every": score_every}
+        self.curve: list[dict[str, float]] = []
+        self.best: dict[str, float] = {}
+        self.seconds = 0.0
+
+    def run(self, resume: bool, checkpoint_seconds: float) -> Path:
+        from tqdm import tqdm
+
+        tensors, progress = {}, {}
+        if resume and self.file.exists():
+            tensors, progress = read_checkpoint(self.file, settings=self.settings)
+        self.ddpg = DDPG(self.task, self.recipe)
+        self.best_actor = Actor(self.task.policy_config)
+        if progress:
+            self.restore(tensors, progress)
+        log = _TensorBoard(self.folder, self.ddpg.iteration)
+        saved = started = time.monotonic()
+        rounds = self.recipe.iterations
+        with tqdm(total=rounds, initial=self.ddpg.iteration, desc="fit policy", unit="round") as bar:
+            while self.ddpg.iteration < rounds:
+                figures = self.ddpg.iterate()
+                bar.update()
+                scored = self.ddpg.iteration % self.score_every == 0 or self.ddpg.iteration == rounds
+                if scored:
+                    self.seconds, started = self.seconds + time.monotonic() - started, time.monotonic()
+                    bar.set_postfix({name: f"{value:.3g}" for name, value in self.score(figures, log).items()})
+                if scored or time.monotonic() - saved > checkpoint_seconds:
+                    self.seconds, started = self.seconds + time.monotonic() - started, time.monotonic()
+                    self.save()
+                    saved = time.monotonic()
+        self.write_card()
+        return self.weights
+
+    def score(self, figures: dict[str, float], log: _TensorBoard) -> dict[str, float]:
+        """Score the policy, add a row to the curve, and keep the policy if there was none better."""
+        transitions = self.ddpg.iteration * self.recipe.num_envs * self.task.length
+        with torch.random.fork_rng(devices=[]), torch.no_grad():
+            score = self.task.score(self.ddpg.actor)
+        place = {"round": self.ddpg.iteration, "transitions": transitions, "seconds": round(self.seconds, 1)}
+        self.curve.append(place | figures | score)
+        log.add(self.curve[-1], self.ddpg.iteration)
+        write_curve(self.folder / "curve.csv", self.curve)
+        if not self.best or _rank(score) >= _rank(self.best):
+            self.best = score | {"round": self.ddpg.iteration}
+            self.best_actor.load_state_dict(self.ddpg.actor.state_dict())
+            self.best_actor.save_pretrained(self.weights)
+        return score | {"best": self.best["success"]}
+
+    def save(self) -> None:
+        tensors = self.ddpg.tensors()
+        tensors |= {f"best.{name}": value for name, value in self.best_actor.state_dict().items()}
+        progress = {"curve": self.curve, "best": self.best, "seconds": self.seconds, "ddpg": self.ddpg.progress()}
+        write_checkpoint(self.file, tensors, settings=self.settings, progress=progress)
+
+    def restore(self, tensors: dict[str, torch.Tensor], progress: dict[str, Any]) -> None:
+        self.ddpg.restore(tensors, progress["ddpg"])
+        self.best_actor.load_state_dict(group(tensors, "best"))
+        self.curve, self.best, self.seconds = progress["curve"], progress["best"], progress["seconds"]
+
+    def write_card(self) -> None:
+        settings = json.loads(json.dumps(self.settings))
+        facts = settings | {"best": self.best, "hours": self.seconds / 3600.0}
+        rows = self.curve[:: max(1, len(self.curve) // 20)]
+        names = ("round", "transitions", "seconds", "success", "steps")
+        table = [{name: row[name] for name in names if name in row} for row in rows]
+        write_card(self.folder / f"{Actor.kind}.md", "Policy", facts, {"Curve": table})
+
+
+def _rank(score: dict[str, float]) -> tuple[float, float]:
+    """Higher is better: the share of successes, then the speed."""
+    return score["success"], -score.get("steps", 0.0)
+
+
+def write_curve(file: Path, curve: list[dict[str, float]]) -> None:
+    """Write rows of figures as CSV, whole or not at all; the columns are those of the last row."""
+    text = io.StringIO()
+    table = csv.DictWriter(text, fieldnames=list(curve[-1]), restval="", extrasaction="ignore")
+    table.writeheader()
+    table.writerows(curve)
+    write_whole(file, lambda temporary: temporary.write_text(text.getvalue()))
+
+
+class _TensorBoard:
+    """TensorBoard's log, where the library is installed."""
+
+    def __init__(self, folder: Path, step: int) -> None:
+        try:
+            from torch.utils.tensorboard import SummaryWriter
+        except ImportError:
+            self.writer = None
+        else:
+            self.writer = SummaryWriter(str(folder), purge_step=step)
+
+    def add(self, figures: dict[str, float], step: int) -> None:
+        """Log ``figures`` at ``step``."""
+        if self.writer is not None:
+            for name, value in figures.items():
+                self.writer.add_scalar(name, value, step)
+            self.writer.flush()
