@@ -36,7 +36,14 @@ class TrapperGoalEnv(TrapperEnv):
     """
 
     def __init__(
-        self, num_envs: int = 1, *, period: int = 5, weights: GoalReward | None = None, max_steps: int = 100, **kw: Any
+        self,
+        num_envs: int = 1,
+        *,
+        period: int = 5,
+        weights: GoalReward | None = None,
+        max_steps: int = 100,
+        redirected: bool = True,
+        **kw: Any,
     ) -> None:
         """Build the batch.
 
@@ -45,11 +52,16 @@ class TrapperGoalEnv(TrapperEnv):
             period: control steps for which an action holds.
             weights: of the reward's terms.
             max_steps: actions after which an episode is truncated.
+            redirected: goals change in mid-episode; else each episode has one.
             **kw: as for `TrapperEnv`: split, seed, scene and num_threads.
         """
         check_number("period", period, minimum=1, integer=True)
-        super().__init__(num_envs, static=True, max_steps=max_steps, **kw)
-        self.period, self.weights = period, weights or GoalReward()
+        super().__init__(num_envs, static=True, max_steps=max_steps, weights=weights, **kw)
+        self.period = period
+        self._kept = (max_steps + 1, max_steps + 1)
+        if redirected:
+            shortest, longest = (max(1, round(seconds / (period * self.scene.control_step))) for seconds in KEPT)
+            self._kept = (shortest, longest)
         self._goals = torch.zeros(num_envs, max_steps + 1, 3)
         self.observation_spec[keys.TOOL_ROTATION] = Unbounded(torch.Size((num_envs, 3, 3)))
 
@@ -62,10 +74,10 @@ class TrapperGoalEnv(TrapperEnv):
             far = torch.tensor([0.0, self.scene.half_side - 2 * self.scene.ball_radius], dtype=torch.float64)
             self.simulation.ball_pos[rows, :2] = far
             self._goals = self._goals.clone()
-            kept = tuple(max(1, round(seconds / (self.period * self.scene.control_step))) for seconds in KEPT)
             self._goals[rows] = draw_goal_sequences(
-                self.scene, self._episode[rows], steps=self._goals.shape[1], kept=kept, split=self.split, seed=self.seed
-            )
+                self.scene, self._episode[rows], steps=self._goals.shape[1], kept=self._kept, split=self.split,
+                seed=self.seed,
+            )  # fmt: skip
         result[keys.TOOL_ROTATION] = self._tool(self.simulation.joint_pos)[1]
         return self._with_goal(result, self._steps)
 
@@ -101,9 +113,18 @@ class TrapperGoalEnv(TrapperEnv):
 
 
 def draw_goal_sequences(
-    scene: TrapperScene, episodes: Tensor, *, steps: int, kept: tuple[int, ...], split: str, seed: int
+    scene: TrapperScene, episodes: Tensor, *, steps: int, kept: tuple[int, int], split: str, seed: int
 ) -> Tensor:
-    """Goals at every step of ``episodes`` (M,): ``(M, steps, 3)`` [m, world], each kept for ``kept`` steps or more."""
+    """Goals at every step of ``episodes`` (M,): ``(M, steps, 3)`` [m, world], kept for so many steps each.
+
+    Args:
+        scene: the arm and the table.
+        episodes: their numbers.
+        steps: length of a sequence.
+        kept: fewest and most steps for which a goal is kept.
+        split: of the episodes.
+        seed: of the episodes.
+    """
     shortest, longest = kept
     count = steps // shortest + 1
     sequences = []

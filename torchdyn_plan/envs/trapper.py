@@ -13,6 +13,7 @@ from torchrl.envs import EnvBase
 from torchdyn_plan import keys
 from torchdyn_plan.checks import check_choice, check_finite, check_number, check_trailing_shape
 from torchdyn_plan.envs.episodes import SPLITS, draw_starts
+from torchdyn_plan.envs.rewards import GoalReward, goal_reward
 from torchdyn_plan.envs.scene import TrapperScene
 from torchdyn_plan.envs.simulation import TrapperSimulation
 from torchdyn_plan.envs.trapping import is_covered, is_pocketed
@@ -32,6 +33,8 @@ class TrapperEnv(EnvBase):
 
     An episode is `terminated` when the ball is trapped (covered, and kept for `HOLD_STEPS` steps) or pocketed, and
     `truncated` after ``max_steps`` control steps. The reward is 1 in the step that traps the ball and 0 elsewhere.
+    With ``static`` it is the paper's `goal_reward`, and the step that traps the ball brings all that the box would earn
+    there until the end, so that an episode which ends early loses nothing.
     Episode i starts as a pure function of (split, seed, i): environments take the next index when they reset, so that
     the same actions give bit-identical episodes whatever ``num_envs`` and ``num_threads``.
     """
@@ -48,6 +51,7 @@ class TrapperEnv(EnvBase):
         scene: TrapperScene | None = None,
         history: int = 24,
         max_steps: int = MAX_STEPS,
+        weights: GoalReward | None = None,
         num_threads: int = 0,
     ) -> None:
         """Build the batch.
@@ -62,6 +66,7 @@ class TrapperEnv(EnvBase):
             scene: geometry and physics; the calibrated scene by default.
             history: length H of `target_history`, in control steps.
             max_steps: control steps after which an episode is truncated.
+            weights: of the terms of the reward with ``static``.
             num_threads: native threads of the simulation, 0 for all cores.
 
         Raises:
@@ -74,7 +79,7 @@ class TrapperEnv(EnvBase):
         check_number("seed", seed, minimum=0, integer=True)
         check_choice("split", split, SPLITS)
         super().__init__(device=torch.device("cpu"), batch_size=torch.Size([num_envs]))
-        self.scene = scene or TrapperScene()
+        self.scene, self.weights = scene or TrapperScene(), weights or GoalReward()
         self.velocity, self.friction, self.static = 0.0 if static else velocity, friction, static
         self.seed, self.split, self.max_steps, self.history = seed, split, max_steps, history
         self.simulation = TrapperSimulation(num_envs, self.scene, friction=friction, num_threads=num_threads)
@@ -160,6 +165,10 @@ class TrapperEnv(EnvBase):
         terminated = result[keys.TRAPPED] | result[keys.POCKETED]
         truncated = (self._steps >= self.max_steps).unsqueeze(-1)
         result["reward"] = trapped.float().unsqueeze(-1)
+        if self.static:
+            reward = goal_reward(self.scene, self.weights, self._tool_pos, rotation, ball)
+            left = (self.max_steps - self._steps + 1).clamp_min(1)
+            result["reward"] = torch.where(trapped.unsqueeze(-1), reward * left.unsqueeze(-1), reward)
         result["terminated"], result["truncated"], result["done"] = terminated, truncated, terminated | truncated
         return result
 
