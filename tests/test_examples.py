@@ -13,10 +13,19 @@ EXAMPLES = Path(__file__).parent.parent / "examples"
         ("01_trap_a_ball.py", "DynamicPlanner  traps"),
         ("02_own_static_planner.py", "target 0.0"),
         ("04_place_the_base.py", "40 of 40 goals reached"),
+        ("train_ddpg_her.py --rounds 2 --num-envs 2 --updates 2", "round    2: mean reward"),
     ],
 )
-def test_example_runs(name, says):
-    run = subprocess.run([sys.executable, EXAMPLES / name], capture_output=True, text=True, check=False, timeout=300)
+def test_example_runs(name, says, tmp_path):
+    file, *words = name.split()
+    run = subprocess.run(
+        [sys.executable, EXAMPLES / file, *words],
+        cwd=tmp_path,
+        capture_output=True,
+        text=True,
+        check=False,
+        timeout=300,
+    )
     assert run.returncode == 0, run.stderr
     assert says in run.stdout
 

@@ -214,6 +214,8 @@ class TrainArguments:
     """Of a policy: control steps for which an action holds while it learns."""
     threads: int = 0
     """Of a policy: threads of the simulation, 0 for all cores; does not change the result."""
+    workers: int = 0
+    """Of a policy: Ray workers that run the episodes, 0 to run them in this process."""
 
     def __post_init__(self) -> None:
         from torchdyn_plan.checks import check_number
@@ -221,7 +223,7 @@ class TrainArguments:
         with _as_usage_error():
             _check_counts(
                 steps=(self.steps, 1), batch=(self.batch, 1), seed=(self.seed, 0), num_envs=(self.num_envs, 1),
-                period=(self.period, 1), threads=(self.threads, 0),
+                period=(self.period, 1), threads=(self.threads, 0), workers=(self.workers, 0),
             )  # fmt: skip
             if self.lr is not None:
                 check_number("lr", self.lr, minimum=1e-9)

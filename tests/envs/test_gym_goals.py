@@ -5,6 +5,7 @@ import pytest
 
 gymnasium = pytest.importorskip("gymnasium")
 from gymnasium.utils.env_checker import check_env  # noqa: E402
+
 from torchdyn_plan.envs.gym_goals import TrapperGymEnv  # noqa: E402
 
 

@@ -5,6 +5,7 @@ import math
 import pytest
 import torch
 from torch import Tensor
+
 from torchdyn_plan import keys
 from torchdyn_plan.envs.goals import TrapperGoalEnv
 from torchdyn_plan.envs.rewards import GoalReward, goal_reward, resting_ball
@@ -68,7 +69,11 @@ def test_one_value_a_row_whatever_the_batch() -> None:
     whole = goal_reward(SCENE, WEIGHTS, tool, rotation, goal)
     rows = [goal_reward(SCENE, WEIGHTS, *row) for row in zip(tool, rotation, goal, strict=True)]
     torch.testing.assert_close(whole, torch.stack(rows))
-    assert goal_reward(SCENE, WEIGHTS, *(x.view(5, 10, *x.shape[1:]) for x in (tool, rotation, goal))).shape == (5, 10, 1)
+    assert goal_reward(SCENE, WEIGHTS, *(x.view(5, 10, *x.shape[1:]) for x in (tool, rotation, goal))).shape == (
+        5,
+        10,
+        1,
+    )
 
 
 def test_step_and_hindsight_agree_on_real_rollouts() -> None:

@@ -2,6 +2,7 @@
 
 import pytest
 import torch
+
 from torchdyn_plan.errors import InputError, WeightsError
 from torchdyn_plan.nets import Actor, Critic, ETANetwork, PolicyConfig
 

@@ -4,6 +4,7 @@ import pytest
 import torch
 from tensordict import TensorDict
 from torch import nn
+
 from torchdyn_plan import keys
 from torchdyn_plan.errors import InputError
 from torchdyn_plan.nets import Actor

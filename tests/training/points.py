@@ -5,10 +5,11 @@ from typing import Any
 import torch
 from tensordict import TensorDict, TensorDictBase
 from torch import Tensor
-from torchdyn_plan import keys
-from torchdyn_plan.nets.policy import Actor, PolicyConfig
 from torchrl.data import Binary, Bounded, Composite, Unbounded
 from torchrl.envs import EnvBase
+
+from torchdyn_plan import keys
+from torchdyn_plan.nets.policy import Actor, PolicyConfig
 
 LENGTH, NEAR = 12, 0.1
 

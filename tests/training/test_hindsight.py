@@ -3,6 +3,7 @@
 import pytest
 import torch
 from tensordict import TensorDict
+
 from torchdyn_plan import keys
 from torchdyn_plan.errors import InputError
 from torchdyn_plan.training.hindsight import HindsightReplayBuffer

@@ -10,12 +10,12 @@ from pathlib import Path
 
 import pytest
 import torch
+
+from tests.training.points import PointTask
 from torchdyn_plan.errors import InputError, TrainingError
 from torchdyn_plan.nets.policy import Actor
 from torchdyn_plan.training.ddpg import DDPG, DDPGRecipe
 from torchdyn_plan.training.policy import fit_policy
-
-from tests.training.points import PointTask
 
 RECIPE = DDPGRecipe(iterations=12, num_envs=8, updates=20, batch=64, capacity=500, warmup=2, gamma=0.9)
 

@@ -123,5 +123,9 @@ class DynamicPlanner(TensorDictModuleBase):
         from torchdyn_plan.nets import ETANetwork, Forecaster
 
         static, forecaster, eta = PRETRAINED[name]
-        parts = STATIC_PLANNERS[static](chunk=chunk), Forecaster.from_pretrained(forecaster), ETANetwork.from_pretrained(eta)
+        parts = (
+            STATIC_PLANNERS[static](chunk=chunk),
+            Forecaster.from_pretrained(forecaster),
+            ETANetwork.from_pretrained(eta),
+        )
         return cls(*parts, chunk=chunk).eval().requires_grad_(False)

@@ -11,7 +11,7 @@ import torch
 from tensordict import TensorDictBase
 from tensordict.nn import TensorDictModule, TensorDictModuleBase, TensorDictSequential
 from torch import Tensor, nn
-from torchrl.collectors import Collector
+from torchrl.collectors import BaseCollector, Collector
 from torchrl.envs import EnvBase
 from torchrl.modules import AdditiveGaussianModule, ValueOperator
 from torchrl.objectives import DDPGLoss, SoftUpdate
@@ -114,7 +114,7 @@ class RandomActionModule(TensorDictModuleBase):
     """Replaces a share of the actions by random ones, as hindsight replay's authors do (Andrychowicz et al., 2017)."""
 
     def __init__(self, spec: Any, share: float) -> None:
-        """Draw from ``spec`` of one batch of environments with probability ``share`` a row."""
+        """Draw from ``spec``, of one environment, with probability ``share`` a row."""
         super().__init__()
         self.spec, self.share = spec, share
         self.in_keys = self.out_keys = [keys.ACTION]
@@ -123,7 +123,7 @@ class RandomActionModule(TensorDictModuleBase):
         """Change ``action`` in some rows."""
         action = tensordict.get(keys.ACTION)
         chosen = torch.rand(action.shape[:-1]) < self.share
-        tensordict.set(keys.ACTION, torch.where(chosen.unsqueeze(-1), self.spec.rand(), action))
+        tensordict.set(keys.ACTION, torch.where(chosen.unsqueeze(-1), self.spec.rand(action.shape[:-1]), action))
         return tensordict
 
 
@@ -169,15 +169,20 @@ class DDPG:
             her_ratio=recipe.her_ratio,
         )  # fmt: skip
         self.env = task.make_env(recipe.num_envs, seed=recipe.seed)
-        self.random = RandomActionModule(self.env.action_spec, recipe.random_share)
-        noise = AdditiveGaussianModule(
-            self.env.action_spec, sigma_init=recipe.noise, sigma_end=recipe.noise, action_key=keys.ACTION
-        )
-        self.collector = Collector(
-            self.env, TensorDictSequential(policy, noise, self.random),
-            frames_per_batch=recipe.num_envs * task.length, total_frames=-1,
-        )  # fmt: skip
+        spec = self.env.action_spec_unbatched
+        self.random = RandomActionModule(spec, recipe.random_share)
+        noise = AdditiveGaussianModule(spec, sigma_init=recipe.noise, sigma_end=recipe.noise, action_key=keys.ACTION)
+        self.collector = self.make_collector(TensorDictSequential(policy, noise, self.random))
         self._rollouts: Iterator[TensorDictBase] = iter(self.collector)
+
+    def make_collector(self, policy: TensorDictModuleBase) -> BaseCollector:
+        """What runs a whole episode of every environment in each round."""
+        return Collector(self.env, policy, frames_per_batch=self.frames, total_frames=-1)
+
+    @property
+    def frames(self) -> int:
+        """Transitions that a round collects."""
+        return self.recipe.num_envs * self.task.length
 
     def iterate(self) -> dict[str, float]:
         """One round: an episode of every environment, then the updates; returns the round's mean figures."""
@@ -195,7 +200,7 @@ class DDPG:
     def collect(self) -> dict[str, float]:
         """Run a whole episode of every environment into the replay buffer."""
         episodes = next(self._rollouts)
-        if not episodes["next", "done"][:, -1].all():
+        if not episodes["next", "done"][..., -1, :].all():
             raise TrainingError(f"episodes must end after {self.task.length} actions, and some did not")
         read = [*SEEN, keys.ACTION, *(("next", key) for key in (*SEEN, keys.ACHIEVED_GOAL, "reward", "done"))]
         self.replay.extend_episodes(episodes.select(*read, ("next", "terminated"), *self.task.stored))
@@ -267,7 +272,15 @@ class DDPG:
         self.optimiser.load_state_dict({"state": states, "param_groups": self.optimiser.state_dict()["param_groups"]})
         self.replay.restore(group(tensors, "replay"), progress["cursor"])
         self.iteration = progress["iteration"]
-        # Episodes end all at once: the simulators are at a reset, which their episodes' numbers decide.
-        self.env.start_from(progress["episode"] - self.recipe.num_envs)
-        self.collector.reset()
+        self.restart_collection(progress["episode"])
         torch.set_rng_state(tensors["generator"])
+
+    def restart_collection(self, episode: int) -> None:
+        """Let the environments begin anew, so that the next reset after this one takes number ``episode``."""
+        # Episodes end all at once: the simulators are at a reset, which their episodes' numbers decide.
+        self.env.start_from(episode - self.recipe.num_envs)
+        self.collector.reset()
+
+    def close(self) -> None:
+        """Stop the collection."""
+        self.collector.shutdown()

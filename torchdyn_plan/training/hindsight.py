@@ -61,7 +61,7 @@ class HindsightReplayBuffer(HERReplayBuffer):
         self.length = length
 
     def extend_episodes(self, episodes: TensorDictBase) -> None:
-        """Add whole ``episodes``, batch ``(N, length)``."""
+        """Add whole ``episodes``, batch ``(*N, length)``."""
         if episodes.batch_size[-1] != self.length:
             raise InputError(f"episodes must have {self.length} transitions, got {episodes.batch_size[-1]}")
         self.extend(episodes.reshape(-1))

@@ -14,6 +14,7 @@ import torch
 
 from torchdyn_plan.checks import check_number
 from torchdyn_plan.cli_arguments import TrainArguments
+from torchdyn_plan.errors import InputError
 from torchdyn_plan.files import write_whole
 from torchdyn_plan.nets.policy import Actor
 from torchdyn_plan.training.card import write_card
@@ -30,7 +31,7 @@ def train_trapper(arguments: TrainArguments) -> Path:
         given |= {"lr_critic": arguments.lr, "lr_actor": arguments.lr / 2}
     recipe = DDPGRecipe(seed=arguments.seed, **{name: value for name, value in given.items() if value is not None})
     task = TrapperTask(period=arguments.period, num_threads=arguments.threads)
-    return fit_policy(task, arguments.out, recipe=recipe, resume=arguments.resume)
+    return fit_policy(task, arguments.out, recipe=recipe, resume=arguments.resume, workers=arguments.workers)
 
 
 def fit_policy(
@@ -41,6 +42,7 @@ def fit_policy(
     resume: bool = True,
     score_every: int = 20,
     checkpoint_seconds: float = 60.0,
+    workers: int = 0,
 ) -> Path:
     """Train a policy for ``task`` by `DDPG`; the best that was scored is kept.
 
@@ -54,6 +56,7 @@ def fit_policy(
         resume: whether to continue from the checkpoint in ``out``.
         score_every: rounds from one score to the next.
         checkpoint_seconds: time between checkpoints [s].
+        workers: Ray workers that run the episodes; 0 runs them here.
 
     Returns:
         The weights' file.
@@ -65,16 +68,18 @@ def fit_policy(
     threads = torch.get_num_threads()
     torch.set_num_threads(1)
     try:
-        return _Training(task, out / Actor.kind, recipe or DDPGRecipe(), score_every).run(resume, checkpoint_seconds)
+        training = _Training(task, out / Actor.kind, recipe or DDPGRecipe(), score_every, workers)
+        return training.run(resume, checkpoint_seconds)
     finally:
         torch.set_num_threads(threads)
 
 
 class _Training:
-    def __init__(self, task: GoalTask, folder: Path, recipe: DDPGRecipe, score_every: int) -> None:
-        self.task, self.folder, self.recipe, self.score_every = task, folder, recipe, score_every
+    def __init__(self, task: GoalTask, folder: Path, recipe: DDPGRecipe, score_every: int, workers: int = 0) -> None:
+        self.task, self.folder, self.recipe, self.score_every, self.workers = task, folder, recipe, score_every, workers
         self.file, self.weights = folder / "checkpoint.safetensors", folder / f"{Actor.kind}.safetensors"
         self.settings = task.settings() | {"recipe": asdict(recipe), "score_every": score_every}
+        self.settings |= {"workers": workers} if workers else {}
         self.curve: list[dict[str, float]] = []
         self.best: dict[str, float] = {}
         self.seconds = 0.0
@@ -85,7 +90,7 @@ class _Training:
         tensors, progress = {}, {}
         if resume and self.file.exists():
             tensors, progress = read_checkpoint(self.file, settings=self.settings)
-        self.ddpg = DDPG(self.task, self.recipe)
+        self.ddpg = self.learner()
         self.best_actor = Actor(self.task.policy_config)
         if progress:
             self.restore(tensors, progress)
@@ -104,8 +109,18 @@ class _Training:
                     self.seconds, started = self.seconds + time.monotonic() - started, time.monotonic()
                     self.save()
                     saved = time.monotonic()
+        self.ddpg.close()
         self.write_card()
         return self.weights
+
+    def learner(self) -> DDPG:
+        if self.workers == 0:
+            return DDPG(self.task, self.recipe)
+        try:
+            from torchdyn_plan.training.cluster import ClusterDDPG
+        except ImportError as error:
+            raise InputError("workers need Ray: pip install 'torchdyn-plan[ray]'") from error
+        return ClusterDDPG(self.task, self.recipe, workers=self.workers)
 
     def score(self, figures: dict[str, float], log: _TensorBoard) -> dict[str, float]:
         """Score the policy, add a row to the curve, and keep the policy if there was none better."""

@@ -1,0 +1,64 @@
+"""The same training with its episodes run by workers of a Ray cluster."""
+
+from __future__ import annotations
+
+from functools import partial
+from typing import Any
+
+import torch
+from tensordict.nn import TensorDictModuleBase
+from torchrl.collectors import BaseCollector
+from torchrl.collectors.distributed import RayCollector
+from torchrl.envs import EnvBase
+
+from torchdyn_plan.errors import InputError
+from torchdyn_plan.training.ddpg import DDPG, DDPGRecipe, GoalTask
+
+
+class ClusterDDPG(DDPG):
+    """`DDPG` whose environments are spread evenly over Ray workers; each worker has its own series of episodes.
+
+    A round waits for all workers, and the next one begins with the policy that the updates left. Workers keep their own
+    random states, which no checkpoint holds: a resumed training goes on, but not to the last bit.
+    """
+
+    def __init__(
+        self, task: GoalTask, recipe: DDPGRecipe, *, workers: int, cluster: dict[str, Any] | None = None
+    ) -> None:
+        """Networks and replay here, collection there.
+
+        Args:
+            task: as for `DDPG`; workers import it, so it must be importable there.
+            recipe: as for `DDPG`.
+            workers: number of Ray workers.
+            cluster: arguments of `ray.init`; a cluster of ``workers`` processors on this machine by default.
+
+        Raises:
+            InputError: the environments cannot be spread evenly.
+        """
+        if workers < 1 or recipe.num_envs % workers:
+            raise InputError(f"workers must divide num_envs {recipe.num_envs} evenly, got {workers}")
+        self.workers = workers
+        self.cluster = cluster or {"num_cpus": workers, "include_dashboard": False, "log_to_driver": False}
+        super().__init__(task, recipe)
+
+    def make_collector(self, policy: TensorDictModuleBase) -> BaseCollector:
+        """A collector on every worker."""
+        share = self.recipe.num_envs // self.workers
+        makers = [
+            partial(_make_env, self.task, share, 1 + self.recipe.seed * self.workers + worker)
+            for worker in range(self.workers)
+        ]
+        return RayCollector(
+            makers, policy, frames_per_batch=self.frames, total_frames=self.recipe.iterations * self.frames, sync=True,
+            update_after_each_batch=True, ray_init_config=self.cluster,
+            remote_configs={"num_cpus": 1, "num_gpus": 0}, init_random_frames=self.recipe.warmup * self.frames,
+        )  # fmt: skip
+
+    def restart_collection(self, episode: int) -> None:
+        """Nothing to do: workers begin their series anew."""
+
+
+def _make_env(task: GoalTask, num_envs: int, seed: int) -> EnvBase:
+    torch.set_num_threads(1)
+    return task.make_env(num_envs, seed=seed)
