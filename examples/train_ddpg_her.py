@@ -6,6 +6,7 @@ python examples/train_ddpg_her.py --rounds 100        # some minutes; `torchdyn-
 import argparse
 
 import torch
+from tensordict import TensorDictBase
 from tensordict.nn import TensorDictModule, TensorDictSequential
 from torchrl.collectors import Collector
 from torchrl.modules import AdditiveGaussianModule, ValueOperator
@@ -26,6 +27,7 @@ torch.manual_seed(arguments.seed)
 torch.set_num_threads(1)
 
 LENGTH, SEEN = 100, ["observation", "desired_goal"]
+AFTER = [*SEEN, "achieved_goal", "tool_pos", "tool_rotation", "reward", "done", "terminated"]
 env = TrapperGoalEnv(arguments.num_envs, max_steps=LENGTH, split="train", seed=arguments.seed)
 actor, critic = Actor(PolicyConfig()), Critic(PolicyConfig())
 shown = env.rollout(LENGTH, break_when_any_done=False).reshape(-1)
@@ -40,7 +42,7 @@ targets = SoftUpdate(loss, tau=0.01)
 optimiser = torch.optim.Adam([{"params": actor.parameters(), "lr": 5e-4}, {"params": critic.parameters(), "lr": 1e-3}])
 
 
-def reward(transitions):
+def reward(transitions: TensorDictBase) -> torch.Tensor:
     """The environment's own reward, for whatever goal hindsight put in."""
     after = transitions["next"]
     return goal_reward(env.scene, env.weights, after["tool_pos"], after["tool_rotation"], transitions["desired_goal"])
@@ -55,17 +57,7 @@ collector = Collector(
 )  # fmt: skip
 
 for number, episodes in enumerate(collector):
-    after = (
-        "observation",
-        "achieved_goal",
-        "desired_goal",
-        "tool_pos",
-        "tool_rotation",
-        "reward",
-        "done",
-        "terminated",
-    )
-    replay.extend_episodes(episodes.select(*SEEN, "action", *(("next", key) for key in after)))
+    replay.extend_episodes(episodes.select(*SEEN, "action", *(("next", key) for key in AFTER)))
     if number > 0:
         for _ in range(arguments.updates):
             losses = loss(replay.sample())

@@ -20,7 +20,7 @@ from torchdyn_plan.training.policy import fit_policy
 RECIPE = DDPGRecipe(iterations=12, num_envs=8, updates=20, batch=64, capacity=500, warmup=2, gamma=0.9)
 
 
-class Cut(Exception):
+class CutError(Exception):
     """A stand-in for a crash."""
 
 
@@ -33,7 +33,7 @@ class CutTask(PointTask):
     def score(self, actor: Actor) -> dict[str, float]:
         self.left -= 1
         if self.left < 0:
-            raise Cut
+            raise CutError
         return super().score(actor)
 
 
@@ -56,7 +56,7 @@ def test_learns_to_reach(tmp_path: Path) -> None:
 def test_interrupted_training_ends_where_an_undisturbed_one_does(tmp_path: Path) -> None:
     fit_policy(PointTask(), tmp_path / "whole", recipe=RECIPE, score_every=2)
     for scores in (1, 2):
-        with pytest.raises(Cut):
+        with pytest.raises(CutError):
             fit_policy(CutTask(scores), tmp_path / "cut", recipe=RECIPE, score_every=2)
     fit_policy(PointTask(), tmp_path / "cut", recipe=RECIPE, score_every=2)
     whole, cut = weights(tmp_path / "whole"), weights(tmp_path / "cut")

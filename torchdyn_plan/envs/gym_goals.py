@@ -33,7 +33,8 @@ class TrapperGymEnv(gymnasium.Env[Observation, np.ndarray[Any, Any]]):
         super().__init__()
         self.env = TrapperGoalEnv(1, seed=seed, redirected=False, **settings)
         spaces = {keys.OBSERVATION: 15, keys.ACHIEVED_GOAL: POSE_SIZE, keys.DESIRED_GOAL: POSE_SIZE}
-        self.observation_space = Dict({key: Box(-np.inf, np.inf, (size,)) for key, size in spaces.items()})
+        space: Any = Dict({key: Box(-np.inf, np.inf, (size,)) for key, size in spaces.items()})
+        self.observation_space = space
         self.action_space = Box(-1.0, 1.0, (6,))
 
     def reset(

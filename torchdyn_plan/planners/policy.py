@@ -38,8 +38,10 @@ class PolicyPlanner(TensorDictModuleBase):
         check_number("period", period, minimum=1, integer=True)
         if chunk is not None:
             check_number("chunk", chunk, minimum=1, integer=True)
-        self.actor, self.period, self.chunk = actor, period, chunk
-        self.in_keys = [keys.ROBOT_STATE, keys.GOAL] + ([keys.STEP_COUNT] if period > 1 else [])
+        act: Any = actor
+        self.actor, self.period, self.chunk = act, period, chunk
+        seen: list[Any] = [keys.ROBOT_STATE, keys.GOAL]
+        self.in_keys = seen + ([keys.STEP_COUNT] if period > 1 else [])
         written: list[Any] = [keys.ACTION]
         self.out_keys = written + ([(keys.PLAN, name) for name in MEMORY_NAMES] if period > 1 else [])
 

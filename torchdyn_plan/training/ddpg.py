@@ -23,7 +23,7 @@ from torchdyn_plan.nets.policy import Actor, Critic, PolicyConfig
 from torchdyn_plan.training.checkpoint import group
 from torchdyn_plan.training.hindsight import HindsightReplayBuffer
 
-SEEN = [keys.OBSERVATION, keys.DESIRED_GOAL]
+SEEN: list[Any] = [keys.OBSERVATION, keys.DESIRED_GOAL]
 """What a policy reads."""
 
 
@@ -168,11 +168,12 @@ class DDPG:
             task.reward, capacity=recipe.capacity, length=task.length, batch_size=recipe.batch,
             her_ratio=recipe.her_ratio,
         )  # fmt: skip
-        self.env = task.make_env(recipe.num_envs, seed=recipe.seed)
+        self.env: Any = task.make_env(recipe.num_envs, seed=recipe.seed)
         spec = self.env.action_spec_unbatched
         self.random = RandomActionModule(spec, recipe.random_share)
         noise = AdditiveGaussianModule(spec, sigma_init=recipe.noise, sigma_end=recipe.noise, action_key=keys.ACTION)
-        self.collector = self.make_collector(TensorDictSequential(policy, noise, self.random))
+        steps: list[Any] = [policy, noise, self.random]
+        self.collector: Any = self.make_collector(TensorDictSequential(*steps))
         self._rollouts: Iterator[TensorDictBase] = iter(self.collector)
 
     def make_collector(self, policy: TensorDictModuleBase) -> BaseCollector:

@@ -67,7 +67,7 @@ class HindsightReplayBuffer(HERReplayBuffer):
         self.extend(episodes.reshape(-1))
 
     def _get_episode_ends(self, storage: Storage) -> Tensor:
-        return torch.arange(self.length - 1, len(storage), self.length)
+        return torch.arange(self.length - 1, len(self), self.length)
 
     def _get_episode_range(self, idx: Tensor, episode_ends: Tensor) -> tuple[Tensor, Tensor]:
         start = idx - idx % self.length
@@ -95,9 +95,11 @@ class HindsightReplayBuffer(HERReplayBuffer):
         for name, value in nested.items():
             entries.set(name, value)
         self.extend(entries)
-        self._writer._cursor = cursor
+        writer: Any = self._writer
+        writer._cursor = cursor
 
     @property
     def cursor(self) -> int:
         """Where the next episode goes."""
-        return int(self._writer._cursor)
+        writer: Any = self._writer
+        return int(writer._cursor)

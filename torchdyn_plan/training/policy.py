@@ -26,7 +26,7 @@ def train_trapper(arguments: TrainArguments) -> Path:
     """Train Trapper's policy as the command line says; returns the weights' file."""
     from torchdyn_plan.training.trapper_task import TrapperTask
 
-    given = {"iterations": arguments.steps, "batch": arguments.batch, "num_envs": arguments.num_envs}
+    given: dict[str, Any] = {"iterations": arguments.steps, "batch": arguments.batch, "num_envs": arguments.num_envs}
     if arguments.lr is not None:
         given |= {"lr_critic": arguments.lr, "lr_actor": arguments.lr / 2}
     recipe = DDPGRecipe(seed=arguments.seed, **{name: value for name, value in given.items() if value is not None})
