@@ -23,6 +23,8 @@ from torchdyn_plan.versions import library_versions, machine
 class Arguments:
     """Drop the box over balls that lie still."""
 
+    static: str = "ik"
+    """Static planner: ik or rl."""
     episodes: int = 1000
     """Number of balls, reachable or not."""
     split: str = "test"
@@ -43,8 +45,8 @@ def main(arguments: Arguments) -> None:
     reachable = is_reachable(scene, place)
     outcome = run_points(
         EvaluateArguments(
-            planners=("pursuit",), velocity=0.0, episodes=arguments.episodes, split=arguments.split,
-            seed=arguments.seed, num_envs=256,
+            planners=("pursuit",), static=arguments.static, velocity=0.0, episodes=arguments.episodes,
+            split=arguments.split, seed=arguments.seed, num_envs=256,
         )
     )["pursuit"]  # fmt: skip
     share = rate(int((outcome.trapped & reachable).sum()), int(reachable.sum()))
@@ -54,7 +56,12 @@ def main(arguments: Arguments) -> None:
     for x, y in place[reachable & ~outcome.trapped].tolist():
         print(f"  not trapped: {x:+.3f} {y:+.3f}")
     if arguments.out is not None:
-        row = {"episodes": arguments.episodes, "reachable": int(reachable.sum()), "success": share._asdict()}
+        row = {
+            "static": arguments.static,
+            "episodes": arguments.episodes,
+            "reachable": int(reachable.sum()),
+            "success": share._asdict(),
+        }
         about = {"machine": machine(), "versions": library_versions(), "scene": scene.digest()}
         write_json(arguments.out, {"config": asdict(arguments) | {"out": str(arguments.out)}} | about | {"rows": [row]})
 

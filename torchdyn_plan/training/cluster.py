@@ -23,7 +23,13 @@ class ClusterDDPG(DDPG):
     """
 
     def __init__(
-        self, task: GoalTask, recipe: DDPGRecipe, *, workers: int, cluster: dict[str, Any] | None = None
+        self,
+        task: GoalTask,
+        recipe: DDPGRecipe,
+        *,
+        workers: int,
+        device: str = "cpu",
+        cluster: dict[str, Any] | None = None,
     ) -> None:
         """Networks and replay here, collection there.
 
@@ -31,6 +37,7 @@ class ClusterDDPG(DDPG):
             task: as for `DDPG`; workers import it, so it must be importable there.
             recipe: as for `DDPG`.
             workers: number of Ray workers.
+            device: where networks learn.
             cluster: arguments of `ray.init`; a cluster of ``workers`` processors on this machine by default.
 
         Raises:
@@ -40,7 +47,7 @@ class ClusterDDPG(DDPG):
             raise InputError(f"workers must divide num_envs {recipe.num_envs} evenly, got {workers}")
         self.workers = workers
         self.cluster = cluster or {"num_cpus": workers, "include_dashboard": False, "log_to_driver": False}
-        super().__init__(task, recipe)
+        super().__init__(task, recipe, device=device)
 
     def make_collector(self, policy: TensorDictModuleBase) -> BaseCollector:
         """A collector on every worker."""

@@ -40,6 +40,8 @@ def collect(arguments: CollectArguments) -> None:
     """
     from tqdm import tqdm
 
+    if arguments.weights is not None:
+        policy_file(arguments.weights)
     scene = TrapperScene()
     torch.set_num_threads(1)
     record = {"paths": _paths, "arrivals": _arrivals}[arguments.what]

@@ -22,6 +22,7 @@ from torchdyn_plan.errors import TrainingError
 from torchdyn_plan.nets.policy import Actor, Critic, PolicyConfig
 from torchdyn_plan.training.checkpoint import group
 from torchdyn_plan.training.hindsight import HindsightReplayBuffer
+from torchdyn_plan.training.optimise import check_device
 
 SEEN: list[Any] = [keys.OBSERVATION, keys.DESIRED_GOAL]
 """What a policy reads."""
@@ -122,8 +123,9 @@ class RandomActionModule(TensorDictModuleBase):
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         """Change ``action`` in some rows."""
         action = tensordict.get(keys.ACTION)
-        chosen = torch.rand(action.shape[:-1]) < self.share
-        tensordict.set(keys.ACTION, torch.where(chosen.unsqueeze(-1), self.spec.rand(action.shape[:-1]), action))
+        chosen = torch.rand(action.shape[:-1]).to(action.device) < self.share
+        drawn = self.spec.rand(action.shape[:-1]).to(action.device)
+        tensordict.set(keys.ACTION, torch.where(chosen.unsqueeze(-1), drawn, action))
         return tensordict
 
 
@@ -147,11 +149,14 @@ class PenalisedDDPGLoss(DDPGLoss):
 class DDPG:
     """Everything that learns, and everything that its next step depends on."""
 
-    def __init__(self, task: GoalTask, recipe: DDPGRecipe) -> None:
-        """Networks, losses, replay and collection of ``recipe``, at their beginning."""
+    def __init__(self, task: GoalTask, recipe: DDPGRecipe, *, device: str = "cpu") -> None:
+        """Networks, losses, replay and collection of ``recipe``, at their beginning; they learn on ``device``."""
+        check_device(device)
         torch.manual_seed(recipe.seed)
+        self.device = torch.device(device)
         self.task, self.recipe, self.iteration = task, recipe, 0
-        self.actor, self.critic = Actor(task.policy_config), Critic(task.policy_config)
+        self.actor = Actor(task.policy_config).to(self.device)
+        self.critic = Critic(task.policy_config).to(self.device)
         policy = TensorDictModule(self.actor, in_keys=SEEN, out_keys=[keys.ACTION])
         value = ValueOperator(self.critic, in_keys=[*SEEN, keys.ACTION])
         self.loss = PenalisedDDPGLoss(policy, value, delay_actor=True, delay_value=True)
@@ -166,7 +171,7 @@ class DDPG:
         self.optimiser = torch.optim.Adam(groups, fused=True)
         self.replay = HindsightReplayBuffer(
             task.reward, capacity=recipe.capacity, length=task.length, batch_size=recipe.batch,
-            her_ratio=recipe.her_ratio,
+            her_ratio=recipe.her_ratio, device=self.device,
         )  # fmt: skip
         self.env: Any = task.make_env(recipe.num_envs, seed=recipe.seed)
         spec = self.env.action_spec_unbatched
@@ -178,7 +183,10 @@ class DDPG:
 
     def make_collector(self, policy: TensorDictModuleBase) -> BaseCollector:
         """What runs a whole episode of every environment in each round."""
-        return Collector(self.env, policy, frames_per_batch=self.frames, total_frames=-1)
+        devices = {} if self.device.type == "cpu" else {"policy_device": self.device, "env_device": "cpu"}
+        return Collector(
+            self.env, policy, frames_per_batch=self.frames, total_frames=-1, storing_device="cpu", **devices
+        )
 
     @property
     def frames(self) -> int:

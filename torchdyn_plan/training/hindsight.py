@@ -35,6 +35,7 @@ class HindsightReplayBuffer(HERReplayBuffer):
         length: int,
         batch_size: int,
         her_ratio: float = 0.8,
+        device: torch.device | str = "cpu",
     ) -> None:
         """An empty buffer.
 
@@ -44,6 +45,7 @@ class HindsightReplayBuffer(HERReplayBuffer):
             length: transitions in an episode.
             batch_size: transitions of a sample.
             her_ratio: share of a sample that is relabelled: its first rows.
+            device: where transitions are kept and sampled.
 
         Raises:
             InputError: ``capacity`` holds no episode.
@@ -55,7 +57,7 @@ class HindsightReplayBuffer(HERReplayBuffer):
             her_ratio=her_ratio,
             strategy="future",
             achieved_goal_key=NEXT_ACHIEVED,
-            storage=LazyTensorStorage(capacity - capacity % length),
+            storage=LazyTensorStorage(capacity - capacity % length, device=device),
             batch_size=batch_size,
         )
         self.length = length

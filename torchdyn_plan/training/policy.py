@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 import csv
 import io
 import json
@@ -31,7 +32,10 @@ def train_trapper(arguments: TrainArguments) -> Path:
         given |= {"lr_critic": arguments.lr, "lr_actor": arguments.lr / 2}
     recipe = DDPGRecipe(seed=arguments.seed, **{name: value for name, value in given.items() if value is not None})
     task = TrapperTask(period=arguments.period, num_threads=arguments.threads)
-    return fit_policy(task, arguments.out, recipe=recipe, resume=arguments.resume, workers=arguments.workers)
+    return fit_policy(
+        task, arguments.out, recipe=recipe, resume=arguments.resume, workers=arguments.workers,
+        device=arguments.device,
+    )  # fmt: skip
 
 
 def fit_policy(
@@ -43,6 +47,7 @@ def fit_policy(
     score_every: int = 20,
     checkpoint_seconds: float = 60.0,
     workers: int = 0,
+    device: str = "cpu",
 ) -> Path:
     """Train a policy for ``task`` by `DDPG`; the best that was scored is kept.
 
@@ -57,6 +62,7 @@ def fit_policy(
         score_every: rounds from one score to the next.
         checkpoint_seconds: time between checkpoints [s].
         workers: Ray workers that run the episodes; 0 runs them here.
+        device: where networks learn; the simulation stays on the CPU.
 
     Returns:
         The weights' file.
@@ -68,15 +74,20 @@ def fit_policy(
     threads = torch.get_num_threads()
     torch.set_num_threads(1)
     try:
-        training = _Training(task, out / Actor.kind, recipe or DDPGRecipe(), score_every, workers)
+        training = _Training(
+            task, out / Actor.kind, recipe or DDPGRecipe(), score_every=score_every, workers=workers, device=device
+        )
         return training.run(resume, checkpoint_seconds)
     finally:
         torch.set_num_threads(threads)
 
 
 class _Training:
-    def __init__(self, task: GoalTask, folder: Path, recipe: DDPGRecipe, score_every: int, workers: int = 0) -> None:
-        self.task, self.folder, self.recipe, self.score_every, self.workers = task, folder, recipe, score_every, workers
+    def __init__(
+        self, task: GoalTask, folder: Path, recipe: DDPGRecipe, *, score_every: int, workers: int, device: str
+    ) -> None:
+        self.task, self.folder, self.recipe = task, folder, recipe
+        self.score_every, self.workers, self.device = score_every, workers, device
         self.file, self.weights = folder / "checkpoint.safetensors", folder / f"{Actor.kind}.safetensors"
         self.settings = task.settings() | {"recipe": asdict(recipe), "score_every": score_every}
         self.settings |= {"workers": workers} if workers else {}
@@ -115,18 +126,18 @@ class _Training:
 
     def learner(self) -> DDPG:
         if self.workers == 0:
-            return DDPG(self.task, self.recipe)
+            return DDPG(self.task, self.recipe, device=self.device)
         try:
             from torchdyn_plan.training.cluster import ClusterDDPG
         except ImportError as error:
             raise InputError("workers need Ray: pip install 'torchdyn-plan[ray]'") from error
-        return ClusterDDPG(self.task, self.recipe, workers=self.workers)
+        return ClusterDDPG(self.task, self.recipe, workers=self.workers, device=self.device)
 
     def score(self, figures: dict[str, float], log: _TensorBoard) -> dict[str, float]:
         """Score the policy, add a row to the curve, and keep the policy if there was none better."""
         transitions = self.ddpg.iteration * self.recipe.num_envs * self.task.length
         with torch.random.fork_rng(devices=[]), torch.no_grad():
-            score = self.task.score(self.ddpg.actor)
+            score = self.task.score(copy.deepcopy(self.ddpg.actor).cpu())
         place = {"round": self.ddpg.iteration, "transitions": transitions, "seconds": round(self.seconds, 1)}
         self.curve.append(place | figures | score)
         log.add(self.curve[-1], self.ddpg.iteration)
