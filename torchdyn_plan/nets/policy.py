@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from typing import Any
 
@@ -66,10 +67,9 @@ class GoalFeatures(nn.Module):
     def raw(self, robot_state: Tensor, goal: Tensor) -> Tensor:
         """The same, not yet standardised."""
         offset = goal - robot_state[..., self.tool]
-        square = offset.square()
-        level = square[..., :2].sum(-1, keepdim=True)
-        distance = (torch.cat([level, level + square[..., 2:]], dim=-1) + 1e-12).sqrt()
-        return torch.cat([robot_state, goal, offset, torch.tanh(offset * self.sharpness), distance], dim=-1)
+        level = torch.linalg.vector_norm(offset[..., :2], dim=-1, keepdim=True)
+        full = torch.linalg.vector_norm(offset, dim=-1, keepdim=True)
+        return torch.cat([robot_state, goal, offset, torch.tanh(offset * self.sharpness), level, full], dim=-1)
 
     @torch.no_grad()
     def set_statistics(self, robot_state: Tensor, goal: Tensor) -> None:
@@ -111,16 +111,22 @@ class Actor(Pretrained, nn.Module):
         Raises:
             InputError: a trailing shape or a device is wrong, or an input holds a NaN.
         """
-        if not torch.compiler.is_compiling():
+        checked = not torch.compiler.is_compiling()
+        if checked:
             self._check(robot_state, goal)
-        return torch.tanh(self.body(self.features(robot_state, goal)))
+        hidden = self.features(robot_state, goal)
+        if checked and not math.isfinite(hidden.sum().item()):
+            check_finite("robot_state", robot_state)
+            check_finite("goal", goal)
+        for layer in self.body:
+            hidden = layer(hidden)
+        return torch.tanh(hidden)
 
     def _check(self, robot_state: Tensor, goal: Tensor) -> None:
         device = self.features.scale.device
         for name, tensor, size in (("robot_state", robot_state, self.config.robot_state_size), ("goal", goal, 3)):
             check_trailing_shape(name, tensor, size)
             check_same_device(name, tensor, device, type(self).__name__)
-            check_finite(name, tensor)
 
 
 class Critic(nn.Module):
@@ -142,6 +148,6 @@ def _perceptron(inputs: int, config: PolicyConfig, outputs: int, *, normalised: 
     layers: list[nn.Module] = []
     width = inputs
     for _ in range(config.layers):
-        layers += [nn.Linear(width, config.hidden), *([nn.LayerNorm(config.hidden)] if normalised else []), nn.ReLU()]
+        layers += [nn.Linear(width, config.hidden), *([nn.LayerNorm(config.hidden)] if normalised else []), nn.ReLU(inplace=True)]
         width = config.hidden
     return nn.Sequential(*layers, nn.Linear(width, outputs))
