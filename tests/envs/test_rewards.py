@@ -37,11 +37,16 @@ def test_box_over_a_ball_at_the_goal_has_reached_it() -> None:
     assert value(over, DOWN, TABLE) == pytest.approx(1.0 + beta, abs=1e-5)
 
 
+def test_box_off_the_middle_has_not_reached_it() -> None:
+    aside = TABLE + torch.tensor([0.012, 0.0, 0.006 - SCENE.ball_radius])
+    assert 0.0 < value(aside, DOWN, TABLE) < WEIGHTS.alignment
+
+
 def test_box_above_waits_at_a_goal_above_only() -> None:
     above = torch.tensor([0.1, -0.3, 0.12])
     assert value(above, DOWN, above) == pytest.approx(1.0 + WEIGHTS.alignment, abs=1e-5)
     assert value(above, DOWN, TABLE) < WEIGHTS.alignment
-    assert value(above + torch.tensor([0.016, 0.0, 0.0]), DOWN, above) < WEIGHTS.alignment
+    assert value(above + torch.tensor([0.011, 0.0, 0.0]), DOWN, above) < WEIGHTS.alignment
     assert value(above, tilted(0.5), above) < WEIGHTS.alignment
 
 

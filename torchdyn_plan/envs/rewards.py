@@ -20,8 +20,8 @@ TABLE_MARGIN = 0.01
 class GoalReward:
     """What the terms of the reward weigh (paper, Section III-A, Equation 1)."""
 
-    tolerance: float = 0.015
-    """A goal above the table is reached within this distance [m]."""
+    tolerance: float = 0.01
+    """A goal is reached within this distance, on the table along each axis sideways [m]."""
     alignment: float = 0.2
     """β at the goal: what an upright box is worth there."""
     alignment_range: float = 0.15
@@ -46,8 +46,8 @@ def goal_reward(
 ) -> Tensor:
     """1(box == g) + β(d)·R(θ), less the cost of touching a ball at g (paper, Section III-A, Equation 1).
 
-    A goal on the table is reached when a ball there would be covered (`is_covered`), one above it within the
-    tolerance. θ is the angle between the box mouth's normal and the table's, R(θ) = 1 - 2 (θ / 60°)², at least -1, and
+    A goal on the table is reached when a ball there would be covered (`is_covered`) and the box is centred over it
+    within the tolerance; one above it by an upright box within the tolerance. θ is the angle between the box mouth's normal and the table's, R(θ) = 1 - 2 (θ / 60°)², at least -1, and
     β(d) = ``alignment`` / (1 + (d / ``alignment_range``)²) grows as the box nears the goal.
 
     Args:
@@ -64,7 +64,8 @@ def goal_reward(
     ball = resting_ball(scene, goal)
     away = (goal - tool_pos).norm(dim=-1)
     above = (away <= weights.tolerance) & (tool_rotation[..., 2, 2] < UPRIGHT)
-    reached = torch.where(on_table, is_covered(scene, tool_pos, tool_rotation, ball), above)
+    centred = (goal - tool_pos)[..., :2].abs().amax(-1) <= weights.tolerance
+    reached = torch.where(on_table, centred & is_covered(scene, tool_pos, tool_rotation, ball), above)
     tilt = torch.arccos((-tool_rotation[..., 2, 2]).clamp(-1.0, 1.0))
     upright = (1.0 - 2.0 * (tilt / (math.pi / 3)).square()).clamp_min(-1.0)
     near = weights.alignment / (1.0 + (away / weights.alignment_range).square())

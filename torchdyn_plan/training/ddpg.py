@@ -58,7 +58,7 @@ class GoalTask(Protocol):
 class DDPGRecipe:
     """How a policy is trained."""
 
-    iterations: int = 1000
+    iterations: int = 400
     """Rounds of collection and updates."""
     num_envs: int = 32
     """Episodes that run side by side: one round collects a whole episode of each."""
@@ -86,7 +86,7 @@ class DDPGRecipe:
     """Deviation of the noise on actions."""
     random_share: float = 0.1
     """Share of actions drawn at random."""
-    action_penalty: float = 0.01
+    action_penalty: float = 0.03
     """Weight of the mean squared action in the actor's loss, times the greatest value."""
     clip: float = 10.0
     """Greatest norm of a gradient."""

@@ -37,7 +37,7 @@ class TrapperTask:
         weights: GoalReward | None = None,
         scene: TrapperScene | None = None,
         config: PolicyConfig | None = None,
-        episodes: int = 200,
+        episodes: int = 400,
         num_threads: int = 0,
     ) -> None:
         """Define the task.
