@@ -113,7 +113,7 @@ def _nearest(trace: Trace, future: Tensor, place: Tensor, when: Tensor, cut: Ten
 def _is_receding(trace: Trace, contact: Tensor) -> Tensor:
     """Whether balls moved away from the box in the step before their first contact (R,)."""
     before = (contact - 1).clamp_min(1)
-    ball, tool = _at(trace.target_pos, before), _at(trace.tool_pos, before)
+    ball, tool = _at(trace.target_pos, before), _at(trace.tool_pos, contact)
     speed, way = (ball - _at(trace.target_pos, before - 1))[..., :2], (tool - ball)[..., :2]
     towards = (speed * way).sum(-1) / way.square().sum(-1).sqrt().clamp_min(1e-9)
     return (contact >= 0) & (towards < -RECEDING)

@@ -31,6 +31,7 @@ from torchdyn_plan.planners import (
     MeetingPlanner,
     OracleTrajectory,
     TargetPursuit,
+    WaitAtEnd,
 )
 from torchdyn_plan.planners.protocol import GoalSearch
 
@@ -45,6 +46,7 @@ HORIZON = 300
 
 PLANNERS: dict[str, Callable[[str], Planner]] = {
     "pursuit": lambda static: TargetPursuit(static_planner(static)),
+    "wait": lambda static: _pretrained(WaitAtEnd, static),
     "corner": lambda static: _pretrained(DynamicPlanner, static),
     "oracle": lambda static: _pretrained(OracleTrajectory, static),
     "exact": lambda static: _pretrained(DynamicPlanner, static, search=ExactSearch()),
