@@ -14,7 +14,11 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 COLOURS = {
-    "pursuit": "#D55E00", "corner": "#0072B2", "oracle": "#009E73", "exact": "#CC79A7", "meet": "#E69F00",
+    "pursuit": "#D55E00",
+    "corner": "#0072B2",
+    "oracle": "#009E73",
+    "exact": "#CC79A7",
+    "meet": "#E69F00",
     "wait": "#56B4E9",
 }
 """The colour of each planner: the palette of Okabe and Ito, told apart by colour-blind readers too."""
