@@ -18,6 +18,13 @@ def rolling(steps=400):
     return path
 
 
+def turned(at, speed):
+    """The same ball, with another speed along x from step ``at`` on."""
+    path = rolling()
+    path[:, at:, 0] += (speed - SPEED) * torch.arange(path.shape[1] - at)
+    return path
+
+
 def record(*, plans=((20, PLACE, MET, True),), tool=((0.0, 0.5, 0.3),) * STEPS, length=STEPS - 1, path=None):
     """One episode, whose plans are made at a step, with a goal, for a step, and reachable or not."""
     goal, arrival = torch.zeros(1, STEPS, 3), torch.zeros(1, STEPS, dtype=torch.int64)
@@ -85,19 +92,25 @@ def test_an_arm_is_as_late_as_it_comes_to_its_goal(since, late):
 
 def test_an_arm_whose_time_has_not_come_is_not_late():
     beside = (PLACE[0] - 0.2, 0.0, 0.006)
-    found = evidence(tool=tool_at(beside, 30))
+    found = evidence(tool=tool_at(beside, 30), path=turned(38, 0.0))
     assert 30 < found.contact_step < MET
     assert found.eta_error == 0
 
 
 def test_a_ball_that_runs_into_the_box_is_not_receding_and_one_that_is_hit_from_behind_is():
     ahead, behind = (0.0, 0.0, 0.006), (-0.3, 0.0, 0.006)
-    ran_into = evidence(tool=tool_at(ahead, 10))
+    ran_into = evidence(tool=tool_at(ahead, 10), path=turned(38, -0.001))
     assert ran_into.contact_step == pytest.approx(MET - (0.2 + 0.113) / SPEED, abs=1)
     assert not ran_into.receding
-    struck = evidence(tool=tool_at(behind, 16))
+    struck = evidence(tool=tool_at(behind, 16), path=turned(17, 0.01))
     assert struck.contact_step == 16
     assert struck.receding
+
+
+def test_a_ball_that_passes_under_the_rim_is_not_touched():
+    low = evidence(tool=tool_at((0.0, 0.0, 0.083), 10))
+    assert low.contact_step == -1
+    assert evidence(tool=tool_at((0.0, 0.0, 0.083), 10), path=turned(60, 0.003)).contact_step > 50
 
 
 def test_after_a_contact_the_truth_is_the_path_of_a_ball_that_nothing_touched():

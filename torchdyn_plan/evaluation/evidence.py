@@ -19,6 +19,9 @@ GONE = 10.0
 """Distance of a ball that has left the table [m]."""
 NEVER = 1000
 """How late an arm is that never comes [control steps]."""
+MOVED, SOON = 0.002, 2
+"""A box that is beside a ball, or low over it, has touched it if the ball is so far off the path of a ball that nothing
+touched [m], so soon after [control steps]."""
 RECEDING = 0.001
 """A ball that moves away from the box faster than this was not waited for [m/step]."""
 
@@ -62,8 +65,7 @@ def find_evidence(scene: TrapperScene, trace: Trace, future: Tensor) -> Evidence
         future: ``(R, F, 3)`` paths of the balls at steps 0 … F-1, had nothing touched them [m, world].
     """
     step = torch.arange(trace.target_pos.shape[1])
-    touched = is_touched(scene, trace.tool_pos, trace.target_pos) & (step <= trace.length.unsqueeze(-1))
-    contact = _first(touched)
+    contact = _first(_is_struck(scene, trace, future) & (step <= trace.length.unsqueeze(-1)))
     cut = torch.where(contact >= 0, contact, trace.length)
 
     acting = step < trace.length.unsqueeze(-1)
@@ -93,6 +95,15 @@ def find_evidence(scene: TrapperScene, trace: Trace, future: Tensor) -> Evidence
         contact_step=contact,
         receding=_is_receding(trace, contact),
     )
+
+
+def _is_struck(scene: TrapperScene, trace: Trace, future: Tensor) -> Tensor:
+    """Whether the box's outside is against a ball that leaves its path by it, ``(R, T)``."""
+    steps = trace.target_pos.shape[1]
+    after = (torch.arange(steps) + SOON).clamp(max=min(steps, future.shape[1]) - 1)
+    after = torch.minimum(after, trace.length.unsqueeze(-1)).unsqueeze(-1).expand_as(trace.target_pos)
+    moved = (trace.target_pos.gather(1, after) - future.gather(1, after))[..., :2].square().sum(-1) > MOVED**2
+    return is_touched(scene, trace.tool_pos, trace.target_pos) & moved
 
 
 def _nearest(trace: Trace, future: Tensor, place: Tensor, when: Tensor, cut: Tensor) -> Tensor:
