@@ -36,28 +36,30 @@ class TraceLog:
     def __init__(self, max_steps: int) -> None:
         """Room for episodes of up to ``max_steps`` control steps."""
         self._max_steps = max_steps
-        self._record = torch.empty(0, max_steps + 1, 12)
+        self._record: Tensor = torch.empty(0, max_steps + 1, 12)
         self._ended: list[Tensor] = []
         self._lengths: list[Tensor] = []
 
     def add(self, stepped: TensorDictBase) -> None:
         """Take in one step of all environments, before it was acted."""
-        tool_pos, step = stepped[keys.TOOL_POS], stepped[keys.STEP_COUNT]
+        tool_pos: Tensor = stepped.get(keys.TOOL_POS)
+        step: Tensor = stepped.get(keys.STEP_COUNT)
         if len(self._record) != len(step):
-            self._record = tool_pos.new_empty(len(step), *self._record.shape[1:])
+            self._record = torch.empty(len(step), self._max_steps + 1, 12)
             self._rows = torch.arange(len(step))
         plan = stepped.get(keys.PLAN, None)
         if plan is None or plan.get("replanned", None) is None:
-            goal, numbers = stepped.get(keys.GOAL, tool_pos), tool_pos.new_zeros(len(step), 3)
+            goal, numbers = stepped.get(keys.GOAL, None), torch.zeros(len(step), 3)
+            goal = tool_pos if goal is None else goal
         else:
-            goal = plan.get("goal")
-            numbers = torch.stack([plan.get("arrival_steps"), plan.get("replanned"), plan.get("reachable")], dim=-1)
+            goal, *numbers = map(plan.get, ("goal", "arrival_steps", "replanned", "reachable"))
+            numbers = torch.stack(numbers, dim=-1)
         entries = torch.cat([tool_pos, stepped[keys.TARGET_POS], goal, numbers], dim=-1)
         self._record[self._rows, step] = entries.to(self._record.dtype)
 
     def end(self, stepped: TensorDictBase, rows: Tensor) -> None:
         """Put the episodes of environments ``rows`` (R,) away, which end with this step."""
-        after = stepped["next"]
+        after: TensorDictBase = stepped.get("next")
         length = after[keys.STEP_COUNT][rows]
         record = self._record[rows]
         last = torch.cat([after[keys.TOOL_POS][rows], after[keys.TARGET_POS][rows]], dim=-1)
