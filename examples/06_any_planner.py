@@ -2,7 +2,6 @@
 
 The static planner below knows only MuJoCo's Jacobian. Its arrival times are collected, a network learns them, and the
 forecaster that ships does the rest. The defaults are small and quick; in earnest:
-
     python examples/06_any_planner.py --sequences 512 --num-envs 256 --steps 6000 --episodes 200 --out FILE.json
 """
 
@@ -65,11 +64,10 @@ def main(sequences: int = 16, num_envs: int = 16, steps: int = 40, episodes: int
         collect(wanted, static, name="mj_jac")
         eta = ETANetwork.from_pretrained(fit_eta(Path(folder), Path(folder), steps=steps))
     parts = static, Forecaster.from_pretrained("trapper"), eta
-    planners = {"corner": DynamicPlanner(*parts), "meet": MeetingPlanner(*parts)}
     setting = EvaluateArguments(episodes=episodes, split="dev", threads=1)
     truth, rows = record_truth(setting), []
-    for name, planner in planners.items():
-        for whose, tried in (("mj_jac", planner), ("ik", PLANNERS[name]("ik"))):
+    for name, kind in (("corner", DynamicPlanner), ("meet", MeetingPlanner)):
+        for whose, tried in (("mj_jac", kind(*parts)), ("ik", PLANNERS[name]("ik"))):
             outcome = run_episodes(tried, setting, *truth, name)
             rows.append(summarize(outcome, planner=name, static=whose, velocity=3.0, friction=0.0))
     print(format_table(rows))
