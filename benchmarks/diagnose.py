@@ -72,12 +72,9 @@ def run_together(
     log, tensordict = EpisodeLog.empty(count), env.reset()
     for _ in trange(MAX_STEPS, leave=False):
         stepped = env.step(planner(tensordict.set(keys.TARGET_FUTURE, future)))
-        log.add(env.scene, stepped)
+        log.add(stepped)
         tensordict = env.step_mdp(stepped)
-    return EpisodeOutcomes(
-        trapped=log.trapped, steps=log.steps, replans=log.replans, touched=log.touched, pocketed=log.pocketed,
-        solvable=solvable, seconds=time.perf_counter() - started,
-    )  # fmt: skip
+    return log.outcomes(env.scene, future, solvable, time.perf_counter() - started)
 
 
 def main(arguments: Arguments) -> None:

@@ -8,7 +8,7 @@ from typing import Literal
 
 from torchdyn_plan.errors import InputError, UsageError
 
-PLANNERS = ("pursuit", "corner", "oracle", "exact", "meet")
+PLANNERS = ("pursuit", "wait", "corner", "oracle", "exact", "meet")
 """Names of the planners for a moving target."""
 
 STATICS = ("ik", "rl")
@@ -68,7 +68,7 @@ class EvaluateArguments:
     """Run episodes at one velocity and friction with each planner; print a table and write the results."""
 
     planners: tuple[str, ...] = PLANNERS
-    """Planners for the moving target: pursuit, corner, oracle, exact, meet."""
+    """Planners for the moving target: pursuit, wait, corner, oracle, exact, meet."""
     static: str = "ik"
     """Static planner that drives the arm: ik (inverse kinematics) or rl (a learned policy)."""
     velocity: float = 3.0
@@ -108,7 +108,7 @@ class SweepArguments:
     values: tuple[float, ...] = ()
     """Velocities [m/s] or friction losses [N]; the paper's when none are given."""
     planners: tuple[str, ...] = PLANNERS
-    """Planners for the moving target: pursuit, corner, oracle, exact, meet."""
+    """Planners for the moving target: pursuit, wait, corner, oracle, exact, meet."""
     static: str = "ik"
     """Static planner that drives the arm: ik (inverse kinematics) or rl (a learned policy)."""
     velocity: float = 3.0

@@ -12,7 +12,7 @@ from torchdyn_plan.envs import TrapperEnv, TrapperScene
 from torchdyn_plan.envs.episodes import draw_starts
 from torchdyn_plan.envs.trapping import is_pocketed
 from torchdyn_plan.evaluation import run
-from torchdyn_plan.evaluation.failures import CAUSES, failure_cause
+from torchdyn_plan.evaluation.failures import CAUSES
 from torchdyn_plan.evaluation.solvability import ArrivalMap
 from torchdyn_plan.planners import (
     CallablePlanner,
@@ -108,6 +108,8 @@ def test_outcomes_do_not_depend_on_environments_or_threads(truth, steps, planner
         other = play(planner(), truth, num_envs=num_envs, threads=threads)
         for name in FIELDS:
             assert torch.equal(getattr(other, name), getattr(expected, name)), (name, num_envs)
+        for clue, same in zip(other.evidence, expected.evidence, strict=True):
+            assert torch.equal(clue, same)
 
 
 def test_a_run_is_always_its_first_episodes(truth, steps):
@@ -195,11 +197,10 @@ def test_a_still_arm_traps_nothing_and_pockets_end_episodes(truth):
     assert torch.equal(outcome.pocketed, sunk)
     assert not outcome.trapped.any()
     assert not outcome.touched.any()
-    causes = failure_cause(outcome.trapped, outcome.solvable, outcome.touched, outcome.pocketed)
-    names = [CAUSES[cause] for cause in causes]
+    names = [CAUSES[cause] for cause in outcome.cause]
     for name, solvable, pocketed in zip(names, truth[1], sunk, strict=True):
-        assert name == ("out_of_reach" if not solvable else "pocketed" if pocketed else "too_late")
-    assert set(names) == {"out_of_reach", "pocketed", "too_late"}
+        assert name == ("unreachable" if not solvable else "pocketed" if pocketed else "late")
+    assert set(names) == {"unreachable", "pocketed", "late"}
 
 
 def test_a_ball_that_leaves_its_recorded_path_was_touched_or_trapped(truth):

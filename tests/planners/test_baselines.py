@@ -4,7 +4,7 @@ from tensordict import TensorDict
 
 from tests.planners.toy import SCHEDULE, SPEED, Straight, StraightArrival, ToyEnv, go_straight, observation
 from torchdyn_plan.errors import InputError
-from torchdyn_plan.planners import DynamicPlanner, OracleTrajectory, TargetPursuit
+from torchdyn_plan.planners import DynamicPlanner, OracleTrajectory, PlanStatus, TargetPursuit, WaitAtEnd
 from torchdyn_plan.planners.baselines import RecordedFuture
 
 
@@ -22,6 +22,20 @@ def test_pursuit_declares_its_keys_and_names_a_missing_one():
     assert planner.out_keys == ["goal", "arrival_steps", "action"]
     with pytest.raises(InputError, match="TargetPursuit reads the key 'target_pos'"):
         planner(TensorDict({}, ()))
+
+
+def test_the_one_who_waits_goes_to_the_end_of_each_forecast():
+    planner, td = WaitAtEnd(go_straight(), Straight(), StraightArrival(), schedule=SCHEDULE), observation((2, 3), 3)
+    td["target_history"] = 0.1 * td["target_history"]
+    end = Straight()(td["target_history"])[..., -1, :]
+    near = planner(td.clone())
+    assert torch.equal(near["goal"], end)
+    assert (near["arrival_steps"] == 40).all()
+    assert near["plan", "reachable"].all()
+    td["target_history"] = td["target_history"] + 1e2
+    far = planner(td.clone())
+    assert not far["plan", "reachable"].any()
+    assert planner.eta.shapes == [(6, 1, 3)] * 2
 
 
 def test_the_recorded_future_begins_with_the_next_step_and_stops_at_its_end():
@@ -57,9 +71,10 @@ def test_the_oracle_never_looks_at_the_history_and_needs_a_recording():
     assert "target_history" not in oracle.in_keys
     with pytest.raises(InputError, match="reads the key 'target_future'"):
         oracle(observation((2,)))
-    broken = observation((2,), step=3).set("target_future", torch.full((2, 9, 3), torch.nan))
-    with pytest.raises(InputError, match="target_future must be finite"):
-        oracle(broken)
+    recording = torch.zeros(2, 9, 3)
+    recording[1, 4] = torch.nan
+    half_broken = oracle(observation((2,), step=3).set("target_future", recording))
+    assert half_broken["plan", "status"].tolist() == [PlanStatus.OK, PlanStatus.BAD_INPUT]
 
 
 @pytest.mark.parametrize("horizon", [0, 1.5])

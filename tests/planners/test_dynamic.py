@@ -123,15 +123,6 @@ def test_keys_are_declared_and_written():
     assert written == set(planner.out_keys)
 
 
-@pytest.mark.parametrize("step", [0, 3, 8])
-@pytest.mark.parametrize("bad", [float("nan"), float("inf")])
-def test_a_history_that_is_not_finite_is_refused(step, bad):
-    td = observation((3,), step)
-    td["target_history"][1, 2, 0] = bad
-    with pytest.raises(InputError, match=r"target_history must be finite, got 1"):
-        make_planner()(td)
-
-
 def test_a_history_of_another_length_than_the_forecasters_is_refused():
     planner, td = make_planner(), observation((3,))
     planner.forecaster.config = type("Config", (), {"history": HISTORY + 1})()

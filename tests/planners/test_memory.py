@@ -3,6 +3,7 @@ import torch
 from torchrl.collectors import Collector
 
 from tests.planners.toy import ToyEnv, assert_same, make_planner, observation
+from torchdyn_plan.planners import PlanStatus
 
 
 def episodes(data):
@@ -71,6 +72,7 @@ def test_a_reset_clears_the_planners_memory_and_leaves_the_static_planners_alone
     assert memory == {
         "window": [12, 10], "countdown": [3, 9], "replans": [0, 1], "arrival_steps": [0, td["arrival_steps"][1]],
         "clamped": [False, True], "reachable": [True, False], "replanned": [False, False], "path": [0, 1],
+        "status": [PlanStatus.WAITING, PlanStatus.UNREACHABLE],
     }  # fmt: skip
 
 

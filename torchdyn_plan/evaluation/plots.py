@@ -13,10 +13,17 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
-COLOURS = {"pursuit": "#D55E00", "corner": "#0072B2", "oracle": "#009E73", "exact": "#CC79A7", "meet": "#E69F00"}
+COLOURS = {
+    "pursuit": "#D55E00",
+    "corner": "#0072B2",
+    "oracle": "#009E73",
+    "exact": "#CC79A7",
+    "meet": "#E69F00",
+    "wait": "#56B4E9",
+}
 """The colour of each planner: the palette of Okabe and Ito, told apart by colour-blind readers too."""
 
-MARKERS = {"pursuit": "s", "corner": "o", "oracle": "^", "exact": "D", "meet": "v"}
+MARKERS = {"pursuit": "s", "corner": "o", "oracle": "^", "exact": "D", "meet": "v", "wait": "P"}
 
 _GREY = "#555555"
 _PALETTE = ("#0072B2", "#56B4E9", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#000000")

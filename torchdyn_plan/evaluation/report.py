@@ -2,14 +2,16 @@
 
 from collections.abc import Callable, Sequence
 
+from torchdyn_plan.evaluation.failures import CAUSES
 from torchdyn_plan.evaluation.results import ResultRow
-
-_CAUSES = ("too_early", "too_late", "out_of_reach", "pocketed")
 
 
 def format_table(rows: Sequence[ResultRow]) -> str:
     """One aligned table of text: a line a row, rates in per cent, the paper's figure beside ours, ``–`` for none."""
     varying = [name for name in ("static", "velocity", "friction") if len({getattr(row, name) for row in rows}) > 1]
+    others = [name for row in rows for name in row.failures]
+    # Results of old know other causes.
+    causes = [name for name in dict.fromkeys((*CAUSES, *others)) if name in others]
     columns: list[tuple[str, Callable[[ResultRow], str]]] = [
         ("planner", lambda row: row.planner),
         *((name, lambda row, name=name: _plain(getattr(row, name))) for name in varying),
@@ -19,7 +21,7 @@ def format_table(rows: Sequence[ResultRow]) -> str:
         ("paper", lambda row: _percent(row.paper_success_solvable)),
         ("steps to trap", lambda row: _number(row.steps_to_trap, 0)),
         ("re-plans", lambda row: _number(row.replans, 1)),
-        *((cause.replace("_", " "), lambda row, cause=cause: _percent(row.failures[cause])) for cause in _CAUSES),
+        *((cause.replace("_", " "), lambda row, cause=cause: _percent(row.failures.get(cause))) for cause in causes),
     ]
     lines = [[name for name, _ in columns], *([cell(row) for _, cell in columns] for row in rows)]
     widths = [max(len(line[i]) for line in lines) for i in range(len(columns))]

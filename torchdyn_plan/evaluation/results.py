@@ -11,7 +11,8 @@ from torch import Tensor
 
 from torchdyn_plan.checks import check_writable_folder
 from torchdyn_plan.errors import InputError
-from torchdyn_plan.evaluation.failures import failure_cause, failure_shares
+from torchdyn_plan.evaluation.evidence import Evidence
+from torchdyn_plan.evaluation.failures import CAUSES, SUCCESS, failure_cause, failure_shares
 from torchdyn_plan.evaluation.intervals import rate
 from torchdyn_plan.evaluation.paper import paper_rate_at
 from torchdyn_plan.files import write_json
@@ -19,6 +20,7 @@ from torchdyn_plan.versions import library_versions, machine
 
 _FLAGS = ("trapped", "touched", "pocketed", "solvable")
 _COUNTS = ("steps", "replans")
+_CLUES = Evidence._fields
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -39,10 +41,14 @@ class EpisodeOutcomes:
     """The static planner could have been at some future place of the ball in time (paper, Section IV-B), bool."""
     seconds: float
     """Wall time of all the episodes [s]."""
+    evidence: Evidence = None  # pyright: ignore[reportAssignmentType]
+    """What decides the cause of a failure; by default that of episodes of which nothing was recorded."""
 
     def __post_init__(self) -> None:
-        for name in (*_FLAGS, *_COUNTS):
-            shape = tuple(getattr(self, name).shape)
+        if self.evidence is None:
+            object.__setattr__(self, "evidence", Evidence.none(self.episodes))
+        for name, tensor in self._tensors().items():
+            shape = tuple(tensor.shape)
             if shape != (self.episodes,) or not self.episodes:
                 raise InputError(f"outcomes.{name} must have shape (E,) = ({self.episodes or '>= 1'},), got {shape}")
         for name in _FLAGS:
@@ -54,26 +60,43 @@ class EpisodeOutcomes:
         """Number of episodes E."""
         return self.trapped.numel()
 
+    @property
+    def cause(self) -> Tensor:
+        """Code of what each episode failed of, as of `failure_cause`, ``(E,)`` int64."""
+        return failure_cause(self.trapped, self.solvable, self.touched, self.pocketed, self.evidence)
+
+    def _tensors(self) -> dict[str, Tensor]:
+        return {name: getattr(self, name) for name in (*_FLAGS, *_COUNTS)} | self.evidence._asdict()
+
     def to_json(self) -> dict[str, Any]:
-        """Lists and numbers for a JSON file."""
-        tensors = {name: getattr(self, name).tolist() for name in (*_FLAGS, *_COUNTS)}
-        return tensors | {"seconds": self.seconds}
+        """Lists and numbers for a JSON file, the cause of each failure among them."""
+        names = [None if code == SUCCESS else CAUSES[code] for code in self.cause.tolist()]
+        tensors = {name: tensor.tolist() for name, tensor in self._tensors().items()}
+        return tensors | {"cause": names, "seconds": self.seconds}
 
     @classmethod
     def from_json(cls, content: Mapping[str, Any]) -> "EpisodeOutcomes":
-        """The outcomes that `to_json` wrote; raises `InputError` if an entry is missing."""
+        """The outcomes that `to_json` wrote, or wrote before there was evidence.
+
+        Raises:
+            InputError: an entry is missing.
+        """
         missing = sorted({*_FLAGS, *_COUNTS, "seconds"} - set(content))
         if missing:
             raise InputError(f"episode outcomes lack {', '.join(missing)}")
         flags = {name: torch.tensor(content[name], dtype=torch.bool) for name in _FLAGS}
         counts = {name: torch.tensor(content[name], dtype=torch.int64) for name in _COUNTS}
-        return cls(**flags, **counts, seconds=float(content["seconds"]))
+        clues = Evidence.none(len(flags["trapped"]))
+        if set(_CLUES) <= set(content):
+            clues = Evidence(*(torch.tensor(content[name]).to(clue.dtype) for name, clue in clues._asdict().items()))
+        return cls(**flags, **counts, seconds=float(content["seconds"]), evidence=clues)
 
     @classmethod
     def merge(cls, parts: Sequence["EpisodeOutcomes"]) -> "EpisodeOutcomes":
         """One after the other, as if they had been one run; their times add up."""
         tensors = {name: torch.cat([getattr(part, name) for part in parts]) for name in (*_FLAGS, *_COUNTS)}
-        return cls(**tensors, seconds=sum(part.seconds for part in parts))
+        evidence = Evidence(*(torch.cat(clues) for clues in zip(*(part.evidence for part in parts), strict=True)))
+        return cls(**tensors, seconds=sum(part.seconds for part in parts), evidence=evidence)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -116,7 +139,6 @@ def summarize(
     trapped, solvable = outcomes.trapped, outcomes.solvable
     everything = rate(int(trapped.sum()), outcomes.episodes)
     possible = rate(int((trapped & solvable).sum()), int(solvable.sum()))
-    causes = failure_cause(trapped, solvable, outcomes.touched, outcomes.pocketed)
     return ResultRow(
         planner=planner,
         static=static,
@@ -131,7 +153,7 @@ def summarize(
         success_solvable_ci=(possible.low, possible.high),
         steps_to_trap=outcomes.steps[trapped].double().mean().item() if bool(trapped.any()) else None,
         replans=outcomes.replans.double().mean().item(),
-        failures=failure_shares(causes),
+        failures=failure_shares(outcomes.cause),
         episodes_per_second=outcomes.episodes / outcomes.seconds if outcomes.seconds > 0 else None,
         paper_success=paper_rate_at(planner, static, velocity, friction, solvable=False),
         paper_success_solvable=paper_rate_at(planner, static, velocity, friction, solvable=True),

@@ -18,11 +18,12 @@ from torchdyn_plan.cli_arguments import EvaluateArguments
 from torchdyn_plan.envs.episodes import draw_starts
 from torchdyn_plan.envs.scene import TrapperScene
 from torchdyn_plan.envs.trapper import MAX_STEPS, TrapperEnv
-from torchdyn_plan.envs.trapping import is_touched
+from torchdyn_plan.evaluation.evidence import Evidence, find_evidence
 from torchdyn_plan.evaluation.plots import plot_results
 from torchdyn_plan.evaluation.report import format_table
 from torchdyn_plan.evaluation.results import EpisodeOutcomes, summarize, write_results
 from torchdyn_plan.evaluation.solvability import arrival_map, is_solvable, record_path
+from torchdyn_plan.evaluation.traces import TraceLog
 from torchdyn_plan.planners import (
     STATIC_PLANNERS,
     DynamicPlanner,
@@ -30,6 +31,7 @@ from torchdyn_plan.planners import (
     MeetingPlanner,
     OracleTrajectory,
     TargetPursuit,
+    WaitAtEnd,
 )
 from torchdyn_plan.planners.protocol import GoalSearch
 
@@ -44,6 +46,7 @@ HORIZON = 300
 
 PLANNERS: dict[str, Callable[[str], Planner]] = {
     "pursuit": lambda static: TargetPursuit(static_planner(static)),
+    "wait": lambda static: _pretrained(WaitAtEnd, static),
     "corner": lambda static: _pretrained(DynamicPlanner, static),
     "oracle": lambda static: _pretrained(OracleTrajectory, static),
     "exact": lambda static: _pretrained(DynamicPlanner, static, search=ExactSearch()),
@@ -123,10 +126,7 @@ def run_episodes(
             bar.update(ended)
             if bar.n >= count:
                 break
-    return EpisodeOutcomes(
-        trapped=log.trapped, steps=log.steps, replans=log.replans, touched=log.touched, pocketed=log.pocketed,
-        solvable=solvable, seconds=time.perf_counter() - started,
-    )  # fmt: skip
+    return log.outcomes(env.scene, future, solvable, time.perf_counter() - started)
 
 
 def play(planner: Planner, env: TrapperEnv, log: EpisodeLog, future: Tensor | None = None) -> Iterator[int]:
@@ -141,7 +141,7 @@ def play(planner: Planner, env: TrapperEnv, log: EpisodeLog, future: Tensor | No
         if future is not None:
             tensordict[keys.TARGET_FUTURE] = future[tensordict[keys.EPISODE].clamp(max=len(future) - 1)]
         stepped, tensordict = env.step_and_maybe_reset(planner(tensordict))
-        yield log.add(env.scene, stepped)
+        yield log.add(stepped)
 
 
 @dataclasses.dataclass
@@ -150,38 +150,64 @@ class EpisodeLog:
 
     done: Tensor
     trapped: Tensor
-    touched: Tensor
     pocketed: Tensor
     steps: Tensor
     replans: Tensor
+    traces: TraceLog
+    """Step by step, all that was seen and planned."""
+    order: list[Tensor]
+    """Numbers of the episodes in the order in which they ended."""
 
     @classmethod
     def empty(cls, count: int) -> EpisodeLog:
         """The log of ``count`` episodes to come."""
-        flags = [torch.zeros(count, dtype=torch.bool) for _ in range(4)]
-        return cls(*flags, steps=torch.full((count,), -1), replans=torch.zeros(count, dtype=torch.int64))
+        flags = [torch.zeros(count, dtype=torch.bool) for _ in range(3)]
+        steps, replans = torch.full((count,), -1), torch.zeros(count, dtype=torch.int64)
+        return cls(*flags, steps=steps, replans=replans, traces=TraceLog(MAX_STEPS), order=[])
 
-    def add(self, scene: TrapperScene, stepped: TensorDict | TensorDictBase) -> int:
+    def add(self, stepped: TensorDict | TensorDictBase) -> int:
         """Take in one step of all environments; returns how many episodes it ended. What comes later does not count."""
+        self.traces.add(stepped)
         after: TensorDictBase = stepped.get("next")
-        episode = after[keys.EPISODE]
-        touched = is_touched(scene, after[keys.TOOL_POS], after[keys.TARGET_POS])
         done = after["done"].squeeze(-1)
+        if not done.any():
+            return 0
+        episode = after[keys.EPISODE]
         ours = episode < len(self.done)
         ours[ours.clone()] = ~self.done[episode[ours]]
-        hit = episode[touched & ours]
-        self.touched[hit] = True
-        ended = done & ours
-        if not ended.any():
+        ended = (done & ours).nonzero().squeeze(-1)
+        if not len(ended):
             return 0
-        rows = episode[ended]
-        trapped = after[keys.TRAPPED].squeeze(-1)[ended]
+        rows, trapped = episode[ended], after[keys.TRAPPED].squeeze(-1)[ended]
         self.done[rows], self.trapped[rows] = True, trapped
         self.pocketed[rows] = after[keys.POCKETED].squeeze(-1)[ended]
         self.steps[rows] = torch.where(trapped, after[keys.STEP_COUNT][ended], -1)
         replans = stepped.get((keys.PLAN, "replans"), None)
         self.replans[rows] = 0 if replans is None else replans[ended]
+        self.traces.end(stepped, ended)
+        self.order.append(rows)
         return len(rows)
+
+    def outcomes(self, scene: TrapperScene, future: Tensor, solvable: Tensor, seconds: float) -> EpisodeOutcomes:
+        """How the episodes ended, and what their records say of it.
+
+        Args:
+            scene: sizes of box and ball.
+            future: ``(E, T, 3)`` paths of the balls, had nothing touched them [m, world].
+            solvable: ``(E,)`` bool, passed on.
+            seconds: wall time of all episodes, passed on.
+        """
+        evidence, begin = Evidence.none(len(self.done)), 0
+        order = torch.cat(self.order) if self.order else torch.empty(0, dtype=torch.int64)
+        for trace in self.traces.traces():
+            rows = order[begin : begin + len(trace.length)]
+            for whole, part in zip(evidence, find_evidence(scene, trace, future[rows]), strict=True):
+                whole[rows] = part
+            begin += len(rows)
+        return EpisodeOutcomes(
+            trapped=self.trapped, steps=self.steps, replans=self.replans, touched=evidence.contact_step >= 0,
+            pocketed=self.pocketed, solvable=solvable, seconds=seconds, evidence=evidence,
+        )  # fmt: skip
 
 
 @contextmanager

@@ -1,6 +1,6 @@
 """Planners: for a static goal, for a moving target, and the baselines; each takes and returns a tensordict."""
 
-from torchdyn_plan.planners.baselines import OracleTrajectory, TargetPursuit
+from torchdyn_plan.planners.baselines import OracleTrajectory, TargetPursuit, WaitAtEnd
 from torchdyn_plan.planners.callable import CallablePlanner
 from torchdyn_plan.planners.drop import Drop
 from torchdyn_plan.planners.dynamic import STATIC_PLANNERS, DynamicPlanner
@@ -11,6 +11,7 @@ from torchdyn_plan.planners.policy import PolicyPlanner
 from torchdyn_plan.planners.protocol import StaticPlanner
 from torchdyn_plan.planners.schedule import ReplanSchedule
 from torchdyn_plan.planners.search import CornerSearch, SearchResult, search_corners
+from torchdyn_plan.planners.status import PlanStatus
 
 __all__ = [
     "STATIC_PLANNERS",
@@ -22,10 +23,12 @@ __all__ = [
     "IKPlanner",
     "MeetingPlanner",
     "OracleTrajectory",
+    "PlanStatus",
     "PolicyPlanner",
     "ReplanSchedule",
     "SearchResult",
     "StaticPlanner",
     "TargetPursuit",
+    "WaitAtEnd",
     "search_corners",
 ]

@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+from typing import TYPE_CHECKING
+
 import torch
 from tensordict import TensorDictBase
 from tensordict.nn import TensorDictModuleBase
@@ -12,6 +15,10 @@ from torchdyn_plan.checks import check_finite, check_number, check_trailing_shap
 from torchdyn_plan.planners.dynamic import DynamicPlanner
 from torchdyn_plan.planners.protocol import ArrivalPredictor, GoalSearch, StaticPlanner, keys_read, keys_written, read
 from torchdyn_plan.planners.schedule import ReplanSchedule
+from torchdyn_plan.planners.search import SearchResult
+
+if TYPE_CHECKING:
+    from torchdyn_plan.nets.eta import Arrival
 
 
 class TargetPursuit(TensorDictModuleBase):
@@ -32,6 +39,34 @@ class TargetPursuit(TensorDictModuleBase):
         now = torch.zeros(target_pos.shape[:-1], dtype=torch.int64, device=target_pos.device)
         tensordict.set(keys.ARRIVAL_STEPS, now)
         return self.static(tensordict)
+
+
+class EndOfForecast:
+    """Search that always chooses the last position of the forecast."""
+
+    def __call__(self, forecast: Tensor, target_pos: Tensor, eta: Callable[..., Arrival]) -> SearchResult:
+        """The end of forecast (*B, F, 3), in F steps; ``eta`` is asked once, whether the robot is ever there."""
+        goal = forecast[..., -1, :]
+        never = eta(goal.unsqueeze(-2)).never.squeeze(-1)
+        steps = torch.full_like(never, forecast.shape[-2], dtype=torch.int64)
+        return SearchResult(goal, steps, torch.zeros_like(never), ~never)
+
+
+class WaitAtEnd(DynamicPlanner):
+    """Goes to where the forecast ends and waits there: the other extreme beside pursuit (paper, Section I)."""
+
+    def __init__(
+        self,
+        static: StaticPlanner,
+        forecaster: Callable[..., Tensor],
+        eta: ArrivalPredictor,
+        *,
+        search: GoalSearch | None = None,
+        schedule: ReplanSchedule | None = None,
+        chunk: int | None = None,
+    ) -> None:
+        """Join the parts as `DynamicPlanner` does; ``search`` is `EndOfForecast` by default."""
+        super().__init__(static, forecaster, eta, search=search or EndOfForecast(), schedule=schedule, chunk=chunk)
 
 
 class RecordedFuture(nn.Module):
@@ -77,4 +112,6 @@ class OracleTrajectory(DynamicPlanner):
     def from_pretrained(cls, name: str, *, chunk: int | None = None) -> OracleTrajectory:
         """The planner of that name with the recorded truth in place of its forecaster; raises what that one raises."""
         planner = DynamicPlanner.from_pretrained(name, chunk=chunk)
-        return cls(planner.static, planner.eta, chunk=chunk).eval().requires_grad_(False)
+        oracle = cls(planner.static, planner.eta, chunk=chunk)
+        oracle.gone_below = planner.gone_below
+        return oracle.eval().requires_grad_(False)

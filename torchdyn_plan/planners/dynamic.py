@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from functools import partial
 
@@ -11,7 +12,7 @@ from tensordict.nn import TensorDictModuleBase
 from torch import Tensor
 
 from torchdyn_plan import keys
-from torchdyn_plan.checks import check_choice, check_finite, check_number, check_same_device, check_trailing_shape
+from torchdyn_plan.checks import check_choice, check_number, check_same_device, check_trailing_shape
 from torchdyn_plan.planners.ik import IKPlanner
 from torchdyn_plan.planners.memory import MEMORY_KEYS, carry_on, recall, remember
 from torchdyn_plan.planners.policy import PolicyPlanner
@@ -19,6 +20,7 @@ from torchdyn_plan.planners.protocol import ArrivalPredictor, GoalSearch, Static
 from torchdyn_plan.planners.rows import apply_to_rows
 from torchdyn_plan.planners.schedule import ReplanSchedule
 from torchdyn_plan.planners.search import CornerSearch, SearchResult
+from torchdyn_plan.planners.status import held, input_status, plan_status, try_again, usable_forecast
 
 STATIC_PLANNERS: dict[str, Callable[..., TensorDictModuleBase]] = {
     "ik": IKPlanner,
@@ -28,6 +30,9 @@ STATIC_PLANNERS: dict[str, Callable[..., TensorDictModuleBase]] = {
 PRETRAINED = {f"trapper-{name}": (name, "trapper", f"trapper-{name}") for name in STATIC_PLANNERS}
 """Name → names of the static planner, of the forecaster's weights, and of the ETA network's weights."""
 
+SUNK = -0.042
+"""A ball of Trapper whose centre is lower is in a pocket [m, world]."""
+
 
 class DynamicPlanner(TensorDictModuleBase):
     """Meets a moving target: history → forecast → goal search → ``goal``, ``arrival_steps`` → static planner → action.
@@ -36,6 +41,10 @@ class DynamicPlanner(TensorDictModuleBase):
     its tool is. A tensordict goes in, of any batch size, and the same one comes out, with `goal` (*B, 3) [m, world],
     `arrival_steps` (*B,), whatever the static planner writes, and the memory for the next step under ``plan``. Rows
     with ``step_count`` 0 start afresh, so that one planner serves environments that reset at different moments.
+
+    ``plan.status`` (*B,) says how each row stands, in the codes of `PlanStatus`. A row that cannot plan when a plan is
+    due, because its input or its forecast is no number or its target is gone, holds its tool still and tries again at
+    every step; other rows do not notice.
     """
 
     def __init__(
@@ -46,6 +55,7 @@ class DynamicPlanner(TensorDictModuleBase):
         *,
         search: GoalSearch | None = None,
         schedule: ReplanSchedule | None = None,
+        gone_below: float | None = None,
         chunk: int | None = None,
     ) -> None:
         """Join the parts.
@@ -57,11 +67,15 @@ class DynamicPlanner(TensorDictModuleBase):
             eta: tells how long ``static`` needs to a goal.
             search: chooses the goal on the forecast; the paper's corner search by default.
             schedule: when to plan anew; the paper's by default.
+            gone_below: a target whose centre is lower has left the table [m, world]; None if it cannot.
             chunk: plan in blocks of exactly this many rows, so that results do not depend on the batch size.
         """
         super().__init__()
         if chunk is not None:
             check_number("chunk", chunk, minimum=1, integer=True)
+        if gone_below is not None:
+            check_number("gone_below", gone_below)
+        self.gone_below = -math.inf if gone_below is None else gone_below
         self.static, self.forecaster, self.eta = static, forecaster, eta
         self.search, self.schedule, self.chunk = search or CornerSearch(), schedule or ReplanSchedule(), chunk
         self.seen_keys = tuple(getattr(forecaster, "in_keys", (keys.TARGET_HISTORY,)))
@@ -73,20 +87,34 @@ class DynamicPlanner(TensorDictModuleBase):
         """Plan where a plan is due, and act.
 
         Raises:
-            InputError: a key is missing, a shape is wrong, the history holds a NaN, or data and networks are on
-                different devices.
+            InputError: a key is missing, a shape is wrong, or data and networks are on different devices.
         """
         tool_pos, target_pos, robot_state, step_count, *seen = self._read(tensordict)
         memory = recall(tensordict)
         clock, due = self.schedule.tick(None if memory is None else memory.clock, step_count)
         meeting = carry_on(memory, tool_pos, step_count)
-        planned = apply_to_rows(self.plan, due, (robot_state, target_pos, *seen), meeting, chunk=self.chunk)
-        remember(tensordict, clock, SearchResult(*planned), replanned=due)
+        trouble = input_status(target_pos, seen, self.gone_below)
+        able = due & (trouble == 0)
+        *planned, usable = apply_to_rows(
+            self._plan_rows, able, (robot_state, target_pos, *seen), (*meeting, able), chunk=self.chunk
+        )
+        failed = due & ~usable
+        meeting = held(SearchResult(*planned), failed, tool_pos)
+        clock = try_again(clock, failed, memory, self.schedule, step_count)
+        status = plan_status(trouble, failed, clock, meeting.reachable)
+        remember(tensordict, clock, meeting, replanned=due & usable, status=status)
         return self.static(tensordict)
 
     def plan(self, robot_state: Tensor, target_pos: Tensor, *seen: Tensor) -> SearchResult:
         """Forecast and choose a meeting, for robot states (*B, S), targets (*B, 3) and what the forecaster reads."""
-        forecast = self.forecaster(*seen)
+        return self._choose(self.forecaster(*seen), robot_state, target_pos)
+
+    def _plan_rows(self, robot_state: Tensor, target_pos: Tensor, *seen: Tensor) -> tuple[Tensor, ...]:
+        """`plan`, whatever the forecaster returns, and whether that was of any use, ``(R,)``."""
+        forecast, usable = usable_forecast(self.forecaster(*seen), target_pos)
+        return *self._choose(forecast, robot_state, target_pos), usable
+
+    def _choose(self, forecast: Tensor, robot_state: Tensor, target_pos: Tensor) -> SearchResult:
         eta = partial(self.eta.arrival, robot_state.unsqueeze(-2))
         return self.search(forecast, target_pos, eta)
 
@@ -109,7 +137,6 @@ class DynamicPlanner(TensorDictModuleBase):
         if history is not None:
             length = getattr(getattr(self.forecaster, "config", None), "history", history.shape[-2])
             check_trailing_shape(keys.TARGET_HISTORY, history, length, 3)
-            check_finite(keys.TARGET_HISTORY, history)
 
     @classmethod
     def from_pretrained(cls, name: str, *, chunk: int | None = None) -> DynamicPlanner:
@@ -123,9 +150,7 @@ class DynamicPlanner(TensorDictModuleBase):
         from torchdyn_plan.nets import ETANetwork, Forecaster
 
         static, forecaster, eta = PRETRAINED[name]
-        parts = (
-            STATIC_PLANNERS[static](chunk=chunk),
-            Forecaster.from_pretrained(forecaster),
-            ETANetwork.from_pretrained(eta),
-        )
-        return cls(*parts, chunk=chunk).eval().requires_grad_(False)
+        networks = Forecaster.from_pretrained(forecaster), ETANetwork.from_pretrained(eta)
+        planner = cls(STATIC_PLANNERS[static](chunk=chunk), *networks, chunk=chunk)
+        planner.gone_below = SUNK
+        return planner.eval().requires_grad_(False)

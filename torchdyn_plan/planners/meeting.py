@@ -13,13 +13,14 @@ from torch import Tensor
 from torchdyn_plan import keys
 from torchdyn_plan.checks import check_number
 from torchdyn_plan.planners.drop import Drop
-from torchdyn_plan.planners.dynamic import DynamicPlanner
+from torchdyn_plan.planners.dynamic import SUNK, DynamicPlanner
 from torchdyn_plan.planners.exact import ExactSearch
 from torchdyn_plan.planners.memory import carry_on, recall, remember
 from torchdyn_plan.planners.protocol import ArrivalPredictor, StaticPlanner
 from torchdyn_plan.planners.rows import apply_to_rows
 from torchdyn_plan.planners.schedule import ReplanSchedule
 from torchdyn_plan.planners.search import SearchResult
+from torchdyn_plan.planners.status import held, input_status, plan_status, try_again, usable_forecast
 
 DROP_NAMES = ("outlook", "outlook_age", "drop_step", "tool_before")
 
@@ -38,7 +39,8 @@ class MeetingPlanner(DynamicPlanner):
     History → forecast → meeting (`ExactSearch`, with goals above the table) → ``goal``: above the meeting place until
     `Drop` finds that now is the time, then down over the target, following it; and up to the next meeting if it was
     missed. The static planner hears of all that through the goal alone. It re-plans often, every 5 steps by default.
-    Rows whose forecast holds a NaN or an infinity stay where they are, take the target to rest and are not `reachable`.
+    Rows that cannot plan hold still as in `DynamicPlanner` and begin no drop on what they knew before; one that has
+    begun goes on.
     """
 
     def __init__(
@@ -53,6 +55,7 @@ class MeetingPlanner(DynamicPlanner):
         table_height: float = 0.042,
         pull: float = 0.044,
         lead: int = 7,
+        gone_below: float | None = SUNK,
         chunk: int | None = None,
     ) -> None:
         """Join the parts.
@@ -68,10 +71,13 @@ class MeetingPlanner(DynamicPlanner):
             table_height: height of a goal that brings the box down [m].
             pull: the goal of a dropping box is at most so far from it, sideways [m].
             lead: it is sent to where the target will be in so many steps: what ``static`` lags behind, and more.
+            gone_below: as for `DynamicPlanner`.
             chunk: plan in blocks of exactly this many rows, so that results do not depend on the batch size.
         """
         schedule = schedule or ReplanSchedule(window=5, shrink=1.0, minimum=5)
-        super().__init__(static, forecaster, eta, search=search or WAITING, schedule=schedule, chunk=chunk)
+        super().__init__(
+            static, forecaster, eta, search=search or WAITING, schedule=schedule, gone_below=gone_below, chunk=chunk
+        )
         self.search: ExactSearch
         self.drop, self.table_height, self.pull, self.lead = drop or Drop(), table_height, pull, lead
         check_number("lead", lead, minimum=0, maximum=self.drop.outlook - 1, integer=True)
@@ -87,17 +93,22 @@ class MeetingPlanner(DynamicPlanner):
         clock, due = self.schedule.tick(None if memory is None else memory.clock, step_count)
         meeting = carry_on(memory, tool_pos, step_count)
         outlook, age, drop_step, tool_before = self._recall_drop(tensordict, tool_pos, target_pos, step_count)
-        outputs = (*meeting, outlook, age)
+        trouble = input_status(target_pos, seen, self.gone_below)
+        able = due & (trouble == 0)
+        outputs = (*meeting, outlook, age, able)
         inputs = (robot_state, target_pos, tool_pos, meeting.arrival_steps, *seen)
-        *planned, outlook, age = apply_to_rows(self.plan_ahead, due, inputs, outputs, chunk=self.chunk)
-        meeting = SearchResult(*planned)
+        *planned, outlook, age, usable = apply_to_rows(self.plan_ahead, able, inputs, outputs, chunk=self.chunk)
+        failed = due & ~usable
+        meeting = held(SearchResult(*planned), failed, tool_pos)
+        clock = try_again(clock, failed, memory, self.schedule, step_count)
 
         path = self._path(outlook, age)
         drop_step = self._drop_step(
             drop_step, path, tool_pos=tool_pos, tool_before=tool_before, target_pos=target_pos,
-            started=clock.replans > 0,
+            started=(clock.replans > 0) & ~failed,
         )  # fmt: skip
-        remember(tensordict, clock, meeting, replanned=due)
+        status = plan_status(trouble, failed, clock, meeting.reachable)
+        remember(tensordict, clock, meeting, replanned=due & usable, status=status)
         entries = dict(zip(DROP_NAMES, (outlook, age + 1, drop_step, tool_pos), strict=True))
         plan = tensordict.get(keys.PLAN)
         plan.update(TensorDict(entries, tensordict.batch_size, device=tensordict.device))
@@ -107,7 +118,7 @@ class MeetingPlanner(DynamicPlanner):
     def plan_ahead(
         self, robot_state: Tensor, target_pos: Tensor, tool_pos: Tensor, planned_steps: Tensor, *seen: Tensor
     ) -> tuple[Tensor, ...]:
-        """Forecast and choose a meeting; returns a `SearchResult`'s entries, the outlook and its age, 0.
+        """Forecast and choose a meeting: a `SearchResult`'s entries, outlook, its age (0), and the forecast's use.
 
         Args:
             robot_state: ``(R, S)``.
@@ -116,17 +127,13 @@ class MeetingPlanner(DynamicPlanner):
             planned_steps: ``(R,)`` control steps from now to the meeting planned before.
             seen: what the forecaster reads.
         """
-        forecast = self.forecaster(*seen)
-        usable = torch.isfinite(forecast).flatten(-2).all(-1)
-        known = torch.where(usable[..., None, None], forecast, target_pos.unsqueeze(-2))
+        known, usable = usable_forecast(self.forecaster(*seen), target_pos)
         eta = partial(self.eta.arrival, robot_state.unsqueeze(-2))
         found = self.search(known, target_pos, eta, tool_pos=tool_pos, planned_steps=planned_steps)
-        goal = torch.where(usable.unsqueeze(-1), found.goal, tool_pos)
         path = torch.cat([target_pos.unsqueeze(-2), known], dim=-2)
         ahead = torch.arange(self._outlook, device=path.device).clamp(max=path.shape[-2] - 1)
         return (
-            goal, found.arrival_steps, found.clamped, found.reachable & usable,
-            path[..., ahead, :], torch.zeros_like(found.arrival_steps),
+            *found, path[..., ahead, :], torch.zeros_like(found.arrival_steps), usable,
         )  # fmt: skip
 
     @property

@@ -12,7 +12,7 @@ from torchdyn_plan import keys
 from torchdyn_plan.planners.schedule import Clock
 from torchdyn_plan.planners.search import SearchResult
 
-MEMORY_NAMES = (*Clock._fields, *SearchResult._fields, "replanned")
+MEMORY_NAMES = (*Clock._fields, *SearchResult._fields, "replanned", "status")
 MEMORY_KEYS: tuple[NestedKey, ...] = tuple((keys.PLAN, name) for name in MEMORY_NAMES)
 
 
@@ -31,11 +31,13 @@ def recall(tensordict: TensorDictBase) -> Memory | None:
     return Memory(Clock(*map(plan.get, Clock._fields)), SearchResult(*map(plan.get, SearchResult._fields)))
 
 
-def remember(tensordict: TensorDictBase, clock: Clock, meeting: SearchResult, replanned: Tensor) -> None:
+def remember(
+    tensordict: TensorDictBase, clock: Clock, meeting: SearchResult, *, replanned: Tensor, status: Tensor
+) -> None:
     """Write the memory, and ``goal`` and ``arrival_steps`` for everybody to read, into ``tensordict``."""
     plan = tensordict.get(keys.PLAN, None)
     entries = {} if plan is None else dict(plan.items())
-    entries.update(zip(MEMORY_NAMES, (*clock, *meeting, replanned), strict=True))
+    entries.update(zip(MEMORY_NAMES, (*clock, *meeting, replanned, status), strict=True))
     # A new one each step: tensordicts of earlier steps may share the old one.
     tensordict.set(keys.PLAN, TensorDict(entries, tensordict.batch_size, device=tensordict.device))
     tensordict.set(keys.GOAL, meeting.goal)

@@ -21,7 +21,7 @@ from torchdyn_plan.envs.simulation import TrapperSimulation
 from torchdyn_plan.envs.trapping import is_pocketed
 from torchdyn_plan.errors import InputError
 from torchdyn_plan.files import write_json, write_whole
-from torchdyn_plan.planners import STATIC_PLANNERS, PolicyPlanner
+from torchdyn_plan.planners import STATIC_PLANNERS, PolicyPlanner, StaticPlanner
 from torchdyn_plan.training.runs import record_runs
 from torchdyn_plan.versions import library_versions
 
@@ -31,8 +31,13 @@ FASTEST = 5.0
 """Balls start with velocities up to this [m/s]."""
 
 
-def collect(arguments: CollectArguments) -> None:
+def collect(arguments: CollectArguments, planner: StaticPlanner | None = None, *, name: str = "own") -> None:
     """Write the shards that ``arguments`` ask for, and a description of them; whole shards that there are are kept.
+
+    Args:
+        arguments: what, how much and where to.
+        planner: a person's own static planner, whose arrivals are measured in place of those of ``arguments.static``.
+        name: what the description calls it.
 
     Raises:
         InputError: a shard that is there was made in another scene or otherwise than ``arguments`` say, or is damaged.
@@ -40,20 +45,21 @@ def collect(arguments: CollectArguments) -> None:
     """
     from tqdm import tqdm
 
-    if arguments.weights is not None:
-        policy_file(arguments.weights)
     scene = TrapperScene()
     torch.set_num_threads(1)
-    record = {"paths": _paths, "arrivals": _arrivals}[arguments.what]
+    static = arguments.static if planner is None else name
+    driver = planner or _driver(arguments)
     shards = -(-arguments.episodes // SHARD[arguments.what])
     for index in tqdm(range(shards), desc=f"collect {arguments.what}", unit="shard"):
         path = arguments.out / f"{arguments.what}-{arguments.seed}-{index:03d}.safetensors"
-        made = _made(arguments, scene, index)
+        made = _made(arguments, scene, index, static)
         if path.exists() and _is_kept(path, made):
             continue
-        tensors = record(arguments, scene, index)
+        paths = arguments.what == "paths"
+        tensors = _paths(arguments, scene, index) if paths else _arrivals(arguments, scene, index, driver)
         write_whole(path, lambda temporary, tensors=tensors, made=made: save_file(tensors, temporary, made))
-    fields = {name: str(value) if isinstance(value, Path) else value for name, value in _fields(arguments).items()}
+    fields = {key: str(value) if isinstance(value, Path) else value for key, value in _fields(arguments).items()}
+    fields["static"] = static
     about = {"arguments": fields, "scene": scene.digest(), "versions": library_versions()}
     write_json(arguments.out / f"{arguments.what}-{arguments.seed}.json", about)
 
@@ -66,14 +72,14 @@ def _fields(arguments: CollectArguments) -> dict[str, Any]:
     return dataclasses.asdict(arguments)
 
 
-def _made(arguments: CollectArguments, scene: TrapperScene, index: int) -> dict[str, str]:
+def _made(arguments: CollectArguments, scene: TrapperScene, index: int, static: str) -> dict[str, str]:
     """What decides a shard's numbers: its metadata."""
     episodes = sum(map(len, _shard_rows(arguments, index)))
     shared = {"scene": scene.digest(), "num_envs": str(arguments.num_envs), "episodes": str(episodes)}
     if arguments.what == "paths":
         return shared
     weights = {} if arguments.weights is None else {"weights": _digest(policy_file(arguments.weights))}
-    return shared | {"static": arguments.static} | weights
+    return shared | {"static": static} | weights
 
 
 def _is_kept(path: Path, made: dict[str, str]) -> bool:
@@ -142,12 +148,17 @@ def _digest(file: Path) -> str:
     return hashlib.sha256(file.read_bytes()).hexdigest()[:16]
 
 
-def _arrivals(arguments: CollectArguments, scene: TrapperScene, index: int) -> dict[str, Tensor]:
-    """Runs of the static planner, whole sequences of every arm."""
+def _driver(arguments: CollectArguments) -> StaticPlanner:
+    """The static planner that ``arguments`` name."""
     if arguments.weights is None:
-        planner = STATIC_PLANNERS[arguments.static]()
-    else:
-        planner = PolicyPlanner.from_pretrained(policy_file(arguments.weights))
+        return STATIC_PLANNERS[arguments.static]()
+    return PolicyPlanner.from_pretrained(policy_file(arguments.weights))
+
+
+def _arrivals(
+    arguments: CollectArguments, scene: TrapperScene, index: int, planner: StaticPlanner
+) -> dict[str, Tensor]:
+    """Runs of the static planner, whole sequences of every arm."""
     task = ReachingTask(planner, arguments.num_envs, scene=scene, num_threads=arguments.threads)
     draw = torch.Generator().manual_seed(arguments.seed * 1_000_003 + index)
     parts = [record_runs(task, draw) for _ in _shard_rows(arguments, index)]

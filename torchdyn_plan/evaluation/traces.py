@@ -1,0 +1,85 @@
+"""The record of episodes, step by step, kept while they run side by side."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import torch
+from tensordict import TensorDictBase
+from torch import Tensor
+
+from torchdyn_plan import keys
+
+
+class Trace(NamedTuple):
+    """Records of R episodes at control steps 0 … T-1; what lies beyond an episode's end is arbitrary."""
+
+    tool_pos: Tensor
+    """``(R, T, 3)`` [m, world]"""
+    target_pos: Tensor
+    """``(R, T, 3)`` [m, world]"""
+    goal: Tensor
+    """``(R, T, 3)`` of the plan in force; of the static planner, if there are no plans [m, world]."""
+    arrival_steps: Tensor
+    """``(R, T)`` int64 control steps to the meeting."""
+    planned: Tensor
+    """``(R, T)`` bool: a plan was made at this step."""
+    reachable: Tensor
+    """``(R, T)`` bool: the robot can be in time for the meeting, by the plan in force."""
+    length: Tensor
+    """``(R,)`` int64: the step at which the episode ended."""
+
+
+class TraceLog:
+    """Records what environments and planner write; each environment's row starts anew with its next episode."""
+
+    def __init__(self, max_steps: int) -> None:
+        """Room for episodes of up to ``max_steps`` control steps."""
+        self._max_steps = max_steps
+        self._record: Tensor = torch.empty(0, max_steps + 1, 12)
+        self._ended: list[Tensor] = []
+        self._lengths: list[Tensor] = []
+
+    def add(self, stepped: TensorDictBase) -> None:
+        """Take in one step of all environments, before it was acted."""
+        tool_pos: Tensor = stepped.get(keys.TOOL_POS)
+        step: Tensor = stepped.get(keys.STEP_COUNT)
+        if len(self._record) != len(step):
+            self._record = torch.empty(len(step), self._max_steps + 1, 12)
+            self._rows = torch.arange(len(step))
+        plan = stepped.get(keys.PLAN, None)
+        if plan is None or plan.get("replanned", None) is None:
+            goal, numbers = stepped.get(keys.GOAL, None), torch.zeros(len(step), 3)
+            goal = tool_pos if goal is None else goal
+        else:
+            goal, *numbers = map(plan.get, ("goal", "arrival_steps", "replanned", "reachable"))
+            numbers = torch.stack(numbers, dim=-1)
+        entries = torch.cat([tool_pos, stepped[keys.TARGET_POS], goal, numbers], dim=-1)
+        self._record[self._rows, step] = entries.to(self._record.dtype)
+
+    def end(self, stepped: TensorDictBase, rows: Tensor) -> None:
+        """Put the episodes of environments ``rows`` (R,) away, which end with this step."""
+        after: TensorDictBase = stepped.get("next")
+        length = after[keys.STEP_COUNT][rows]
+        record = self._record[rows]
+        last = torch.cat([after[keys.TOOL_POS][rows], after[keys.TARGET_POS][rows]], dim=-1)
+        record[torch.arange(len(rows)), length, :6] = last.to(record.dtype)
+        self._ended.append(record)
+        self._lengths.append(length)
+
+    def traces(self, block: int = 256) -> list[Trace]:
+        """The episodes put away, in the order in which they ended, ``block`` at a time."""
+        if not self._ended:
+            return []
+        records, lengths = torch.cat(self._ended), torch.cat(self._lengths)
+        return [
+            _split(record, length) for record, length in zip(records.split(block), lengths.split(block), strict=True)
+        ]
+
+
+def _split(record: Tensor, length: Tensor) -> Trace:
+    tool_pos, target_pos, goal, arrival, planned, reachable = record.split([3, 3, 3, 1, 1, 1], dim=-1)
+    return Trace(
+        tool_pos, target_pos, goal, arrival.squeeze(-1).long(), planned.squeeze(-1) > 0, reachable.squeeze(-1) > 0,
+        length,
+    )  # fmt: skip
