@@ -47,8 +47,9 @@ def goal_reward(
     """1(box == g) + β(d)·R(θ), less the cost of touching a ball at g (paper, Section III-A, Equation 1).
 
     A goal on the table is reached when a ball there would be covered (`is_covered`) and the box is centred over it
-    within the tolerance; one above it by an upright box within the tolerance. θ is the angle between the box mouth's normal and the table's, R(θ) = 1 - 2 (θ / 60°)², at least -1, and
-    β(d) = ``alignment`` / (1 + (d / ``alignment_range``)²) grows as the box nears the goal.
+    within the tolerance; one above it by an upright box within the tolerance. θ is the angle between the box mouth's
+    normal and the table's, R(θ) = 1 - 2 (θ / 60°)², at least -1, and β(d) = ``alignment`` / (1 + (d /
+    ``alignment_range``)²) grows as the box nears the goal.
 
     Args:
         scene: sizes of box and ball.
