@@ -148,10 +148,9 @@ def _perceptron(inputs: int, config: PolicyConfig, outputs: int, *, normalised: 
     layers: list[nn.Module] = []
     width = inputs
     for _ in range(config.layers):
-        layers += [
-            nn.Linear(width, config.hidden),
-            *([nn.LayerNorm(config.hidden)] if normalised else []),
-            nn.ReLU(inplace=True),
-        ]
+        layers.append(nn.Linear(width, config.hidden))
+        if normalised:
+            layers.append(nn.LayerNorm(config.hidden))
+        layers.append(nn.ReLU(inplace=True))
         width = config.hidden
     return nn.Sequential(*layers, nn.Linear(width, outputs))
