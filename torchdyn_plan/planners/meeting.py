@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from functools import partial
-from typing import Any
 
 import torch
 from tensordict import TensorDict, TensorDictBase
@@ -15,13 +13,12 @@ from torchdyn_plan.checks import check_number
 from torchdyn_plan.planners.drop import Drop
 from torchdyn_plan.planners.dynamic import DynamicPlanner
 from torchdyn_plan.planners.exact import ExactSearch
-from torchdyn_plan.planners.memory import carry_on, recall, remember
+from torchdyn_plan.planners.latency import skip_steps, where_rows
 from torchdyn_plan.planners.protocol import ArrivalPredictor, StaticPlanner
-from torchdyn_plan.planners.rows import apply_to_rows
-from torchdyn_plan.planners.schedule import ReplanSchedule
+from torchdyn_plan.planners.schedule import ReplanSchedule, Schedule
 from torchdyn_plan.planners.search import SearchResult
 
-DROP_NAMES = ("outlook", "outlook_age", "drop_step", "tool_before")
+DROP_NAMES = ("drop_step", "tool_before")
 
 FOLLOW_AFTER = 2
 """Control steps that a box goes straight down before it follows the target."""
@@ -41,6 +38,8 @@ class MeetingPlanner(DynamicPlanner):
     Rows whose forecast holds a NaN or an infinity stay where they are, take the target to rest and are not `reachable`.
     """
 
+    keeps_outlook, own_names = True, DROP_NAMES
+
     def __init__(
         self,
         static: StaticPlanner,
@@ -48,7 +47,8 @@ class MeetingPlanner(DynamicPlanner):
         eta: ArrivalPredictor,
         *,
         search: ExactSearch | None = None,
-        schedule: ReplanSchedule | None = None,
+        schedule: Schedule | None = None,
+        latency: int = 0,
         drop: Drop | None = None,
         table_height: float = 0.042,
         pull: float = 0.044,
@@ -64,41 +64,35 @@ class MeetingPlanner(DynamicPlanner):
             search: chooses where to wait, and when for.
             schedule: when to plan anew; every 5 steps from step 13 by default. A multiple of the search's stride keeps
                 its candidates on the same places of the path, and so the tool still while it waits.
+            latency: as for `DynamicPlanner`. Whether to drop is decided at every step, on the forecast in use.
             drop: sizes and the descent of ``static``.
             table_height: height of a goal that brings the box down [m].
             pull: the goal of a dropping box is at most so far from it, sideways [m].
             lead: it is sent to where the target will be in so many steps: what ``static`` lags behind, and more.
             chunk: plan in blocks of exactly this many rows, so that results do not depend on the batch size.
         """
-        schedule = schedule or ReplanSchedule(window=5, shrink=1.0, minimum=5)
-        super().__init__(static, forecaster, eta, search=search or WAITING, schedule=schedule, chunk=chunk)
+        schedule = schedule or ReplanSchedule.every(5)
+        super().__init__(
+            static, forecaster, eta, search=search or WAITING, schedule=schedule, latency=latency, chunk=chunk
+        )
         self.search: ExactSearch
         self.drop, self.table_height, self.pull, self.lead = drop or Drop(), table_height, pull, lead
         check_number("lead", lead, minimum=0, maximum=self.drop.outlook - 1, integer=True)
         for name, value in (("table_height", table_height), ("pull", pull)):
             check_number(name, value, minimum=0.0)
-        written: list[Any] = list(self.out_keys)
-        self.out_keys = written + [(keys.PLAN, name) for name in DROP_NAMES]
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         """Plan where a plan is due, wait or drop, and act; raises what `DynamicPlanner.forward` raises."""
         tool_pos, target_pos, robot_state, step_count, *seen = self._read(tensordict)
-        memory = recall(tensordict)
-        clock, due = self.schedule.tick(None if memory is None else memory.clock, step_count)
-        meeting = carry_on(memory, tool_pos, step_count)
-        outlook, age, drop_step, tool_before = self._recall_drop(tensordict, tool_pos, target_pos, step_count)
-        outputs = (*meeting, outlook, age)
-        inputs = (robot_state, target_pos, tool_pos, meeting.arrival_steps, *seen)
-        *planned, outlook, age = apply_to_rows(self.plan_ahead, due, inputs, outputs, chunk=self.chunk)
-        meeting = SearchResult(*planned)
-
-        path = self._path(outlook, age)
+        drop_step, tool_before = self._recall_drop(tensordict, tool_pos, step_count)
+        meeting, outlook = self._replan(tensordict, tool_pos, target_pos, robot_state, step_count, *seen)
+        assert outlook is not None
+        path = outlook.ahead(self.drop.outlook)
         drop_step = self._drop_step(
             drop_step, path, tool_pos=tool_pos, tool_before=tool_before, target_pos=target_pos,
-            started=clock.replans > 0,
+            started=outlook.age >= 0,
         )  # fmt: skip
-        remember(tensordict, clock, meeting, replanned=due)
-        entries = dict(zip(DROP_NAMES, (outlook, age + 1, drop_step, tool_pos), strict=True))
+        entries = dict(zip(DROP_NAMES, (drop_step, tool_pos), strict=True))
         plan = tensordict.get(keys.PLAN)
         plan.update(TensorDict(entries, tensordict.batch_size, device=tensordict.device))
         tensordict.set(keys.GOAL, self._goal(meeting, path, tool_pos, drop_step))
@@ -107,55 +101,33 @@ class MeetingPlanner(DynamicPlanner):
     def plan_ahead(
         self, robot_state: Tensor, target_pos: Tensor, tool_pos: Tensor, planned_steps: Tensor, *seen: Tensor
     ) -> tuple[Tensor, ...]:
-        """Forecast and choose a meeting; returns a `SearchResult`'s entries, the outlook and its age, 0.
-
-        Args:
-            robot_state: ``(R, S)``.
-            target_pos: ``(R, 3)`` [m, world].
-            tool_pos: ``(R, 3)`` [m, world].
-            planned_steps: ``(R,)`` control steps from now to the meeting planned before.
-            seen: what the forecaster reads.
-        """
+        """Forecast and choose a meeting, as `DynamicPlanner.plan_ahead`."""
         forecast = self.forecaster(*seen)
         usable = torch.isfinite(forecast).flatten(-2).all(-1)
         known = torch.where(usable[..., None, None], forecast, target_pos.unsqueeze(-2))
-        eta = partial(self.eta.arrival, robot_state.unsqueeze(-2))
+        known, target_pos = skip_steps(known, target_pos, self.latency)
+        eta = self._arrival(robot_state)
         found = self.search(known, target_pos, eta, tool_pos=tool_pos, planned_steps=planned_steps)
         goal = torch.where(usable.unsqueeze(-1), found.goal, tool_pos)
-        path = torch.cat([target_pos.unsqueeze(-2), known], dim=-2)
-        ahead = torch.arange(self._outlook, device=path.device).clamp(max=path.shape[-2] - 1)
-        return (
-            goal, found.arrival_steps, found.clamped, found.reachable & usable,
-            path[..., ahead, :], torch.zeros_like(found.arrival_steps),
-        )  # fmt: skip
+        meeting = (goal, found.arrival_steps, found.clamped, found.reachable & usable)
+        return (*meeting, *self._outlook(known, target_pos))
 
     @property
-    def _outlook(self) -> int:
-        """Positions kept from a forecast: those that a drop looks at before the next plan is due, or a little later."""
-        return self.drop.outlook + 8
+    def outlook_steps(self) -> int:
+        """Positions kept from a forecast: those that a drop looks at before the next plan is there, or a little later.
 
-    def _recall_drop(
-        self, tensordict: TensorDictBase, tool_pos: Tensor, target_pos: Tensor, step_count: Tensor
-    ) -> tuple[Tensor, ...]:
-        """Outlook (*B, T, 3) and its age, steps since a drop began (-1: none), and the tool a step ago (*B, 3)."""
-        nothing = target_pos.unsqueeze(-2).expand(*target_pos.shape[:-1], self._outlook, 3)
-        zero = torch.zeros_like(step_count)
-        start = (nothing, zero, zero - 1, tool_pos)
-        plan = tensordict.get(keys.PLAN, None)
-        if plan is None or plan.get(DROP_NAMES[0], None) is None:
-            return start
+        A plan that is due while another is under way waits for the next window.
+        """
+        return self.drop.outlook + max(8, self.schedule.longest) + 2 * self.latency
+
+    def _recall_drop(self, tensordict: TensorDictBase, tool_pos: Tensor, step_count: Tensor) -> tuple[Tensor, Tensor]:
+        """Steps since a drop began (-1: none) ``(*B,)``, and the tool a step ago ``(*B, 3)``."""
+        none, plan = torch.full_like(step_count, -1), tensordict.get(keys.PLAN, None)
+        drop_step = None if plan is None else plan.get(DROP_NAMES[0], None)
+        if plan is None or drop_step is None:
+            return none, tool_pos
         fresh = step_count == 0
-        old = map(plan.get, DROP_NAMES)
-        return tuple(
-            torch.where(fresh[(..., *[None] * (new.ndim - fresh.ndim))], new, value)
-            for new, value in zip(start, old, strict=True)
-        )
-
-    def _path(self, outlook: Tensor, age: Tensor) -> Tensor:
-        """The outlook from now on, ``(*B, drop.outlook, 3)``; its last position is repeated beyond its end."""
-        ahead = torch.arange(self.drop.outlook, device=age.device)
-        index = (age.unsqueeze(-1) + ahead).clamp(max=outlook.shape[-2] - 1)
-        return outlook.gather(-2, index.unsqueeze(-1).expand(*index.shape, 3))
+        return torch.where(fresh, none, drop_step), where_rows(fresh, tool_pos, plan.get(DROP_NAMES[1]))
 
     def _drop_step(
         self,

@@ -31,11 +31,14 @@ def recall(tensordict: TensorDictBase) -> Memory | None:
     return Memory(Clock(*map(plan.get, Clock._fields)), SearchResult(*map(plan.get, SearchResult._fields)))
 
 
-def remember(tensordict: TensorDictBase, clock: Clock, meeting: SearchResult, replanned: Tensor) -> None:
+def remember(
+    tensordict: TensorDictBase, clock: Clock, meeting: SearchResult, replanned: Tensor, **others: Tensor
+) -> None:
     """Write the memory, and ``goal`` and ``arrival_steps`` for everybody to read, into ``tensordict``."""
     plan = tensordict.get(keys.PLAN, None)
     entries = {} if plan is None else dict(plan.items())
     entries.update(zip(MEMORY_NAMES, (*clock, *meeting, replanned), strict=True))
+    entries.update(others)
     # A new one each step: tensordicts of earlier steps may share the old one.
     tensordict.set(keys.PLAN, TensorDict(entries, tensordict.batch_size, device=tensordict.device))
     tensordict.set(keys.GOAL, meeting.goal)
