@@ -160,7 +160,7 @@ class DynamicPlanner(TensorDictModuleBase):
         if self._with_outlook:
             used += recall_outlook(tensordict, target_pos, step_count, self.outlook_steps)
         values, busy = self.delivery.arrive(kept, dict(zip(self._value_names, used, strict=True)), step_count)
-        look = partial(self._look, values, target_pos, tool_pos, robot_state)
+        look = partial(self._look, values, target_pos, robot_state)
         clock, due = self.schedule.tick(None if memory is None else memory.clock, step_count, busy=busy, look=look)
         planned_steps = (values["arrival_steps"] - self.latency).clamp_min(0)
         inputs = (robot_state, target_pos, tool_pos, planned_steps, *seen)
@@ -171,15 +171,15 @@ class DynamicPlanner(TensorDictModuleBase):
         remember(tensordict, clock, meeting, due, **dict(zip(OUTLOOK_NAMES, outlook)), **pending)  # noqa: B905
         return meeting, Outlook(*outlook) if outlook else None
 
-    def _look(self, values: Values, target_pos: Tensor, tool_pos: Tensor, robot_state: Tensor, rows: Tensor) -> Drift:
+    def _look(self, values: Values, target_pos: Tensor, robot_state: Tensor, rows: Tensor) -> Drift:
         """How far the plan in use has drifted, in ``rows`` (*B,)."""
         steps, outlook = values["arrival_steps"], Outlook(values["outlook"], values["outlook_age"])
         miss = torch.linalg.vector_norm(outlook.ahead(1).squeeze(-2) - target_pos, dim=-1)
-        inputs = (robot_state, tool_pos, values["goal"], steps)
+        inputs = (robot_state, values["goal"], steps)
         (late,) = apply_to_rows(self._late, rows, inputs, (torch.zeros_like(miss),), chunk=self.chunk)
         return Drift(miss, late, steps == 0)
 
-    def _late(self, robot_state: Tensor, tool_pos: Tensor, goal: Tensor, planned_steps: Tensor) -> tuple[Tensor]:
+    def _late(self, robot_state: Tensor, goal: Tensor, planned_steps: Tensor) -> tuple[Tensor]:
         """Predicted steps to the goal less the planned ones, ``(R,)``."""
         arrival = self.eta.arrival(robot_state.unsqueeze(-2), goal.unsqueeze(-2), reading="expectation")
         needed = arrival.steps.masked_fill(arrival.never, torch.inf).squeeze(-1)
