@@ -13,6 +13,7 @@ EXAMPLES = Path(__file__).parent.parent / "examples"
         ("01_trap_a_ball.py", "DynamicPlanner  traps"),
         ("02_own_static_planner.py", "target 0.0"),
         ("04_place_the_base.py", "40 of 40 goals reached"),
+        ("05_real_time_loop.py", "plans came into use"),
     ],
 )
 def test_example_runs(name, says):
