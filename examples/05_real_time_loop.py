@@ -12,7 +12,7 @@ from torchdyn_plan.envs import TrapperEnv
 from torchdyn_plan.planners import Background, MeetingPlanner, measured_latency
 
 STEP = 0.004  # length of a control step [s]
-STEPS = 1000  # four seconds
+STEPS = 500  # two seconds
 
 torch.set_num_threads(1)
 env = TrapperEnv(num_envs=1, velocity=2.0, seed=0, num_threads=1)
