@@ -4,6 +4,8 @@ import pytest
 import torch
 
 from tests.planners.test_latency import run
+from tests.planners.test_meeting import line
+from tests.planners.test_meeting import make_planner as make_meeting_planner
 from tests.planners.toy import assert_same, make_planner, observation
 from torchdyn_plan.errors import InputError
 from torchdyn_plan.planners import ReplanSchedule
@@ -72,6 +74,22 @@ def test_past_the_deadline_the_last_valid_goal_is_kept():
     found, delivery = play(6)
     assert all(torch.equal(td["goal"], found[0]["goal"]) for td in found)
     assert (delivery.used, delivery.missed) == (0, 3)
+
+
+def test_no_drop_begins_when_plans_stay_away():
+    """The first plan comes, the others never do: what is known of the path ends before the target is there."""
+    drops = []
+    for deadline in (4, 400):
+        executor = ByHand(2)
+        planner = make_meeting_planner(schedule=ReplanSchedule.every(5))
+        planner.set_latency(2, Background(latency=2, deadline=deadline, executor=executor))
+        scene, plan = line(), None
+        for step in range(140):
+            executor.now, executor.steps = step, 2 if step < 20 or deadline > 4 else 9
+            plan = scene.run(planner, 1, plan)[0]["plan"]
+            drops.append((deadline, int(plan["drop_step"])))
+    assert max(step for deadline, step in drops if deadline == 400) > 10
+    assert max(step for deadline, step in drops if deadline == 4) == -1
 
 
 def test_a_plan_for_an_episode_that_is_over_is_dropped():

@@ -88,9 +88,11 @@ class MeetingPlanner(DynamicPlanner):
         meeting, outlook = self._replan(tensordict, tool_pos, target_pos, robot_state, step_count, *seen)
         assert outlook is not None
         path = outlook.ahead(self.drop.outlook)
+        # When plans stay away, what is known of the path ends too soon to begin a drop.
+        known = (outlook.age >= 0) & (outlook.age + self.drop.outlook <= outlook.path.shape[-2])
         drop_step = self._drop_step(
             drop_step, path, tool_pos=tool_pos, tool_before=tool_before, target_pos=target_pos,
-            started=outlook.age >= 0,
+            known=known,
         )  # fmt: skip
         entries = dict(zip(DROP_NAMES, (drop_step, tool_pos), strict=True))
         plan = tensordict.get(keys.PLAN)
@@ -137,7 +139,7 @@ class MeetingPlanner(DynamicPlanner):
         tool_pos: Tensor,
         tool_before: Tensor,
         target_pos: Tensor,
-        started: Tensor,
+        known: Tensor,
     ) -> Tensor:
         """Steps since the drop began, -1 for none: begins when it is best to begin now, ends when it has missed."""
         drop = self.drop
@@ -145,7 +147,7 @@ class MeetingPlanner(DynamicPlanner):
         clearance = drop.clearance(path, tool_pos, tool_pos - tool_before)
         now = (clearance.argmax(-1) == 0) & (clearance[..., 0] > 0.0)
         above = (tool_pos[..., 2] > 0.95 * 2 * drop.radius) & (path[..., 2] > 0.0).all(-1)
-        step = torch.where((step < 0) & started & now & above, 0, step)
+        step = torch.where((step < 0) & known & now & above, 0, step)
         outside = (target_pos - tool_pos)[..., :2].abs().amax(-1) > drop.half_width + 0.01
         down = tool_pos[..., 2] < 1.2 * drop.radius
         return torch.where(outside & (step > 8) & (down | (step > 40)), -1, step)
