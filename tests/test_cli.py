@@ -62,6 +62,8 @@ BAD = [
     (["evaluate", "--velocity", "-1"], "velocity must be in [0, 20], got -1.0"),
     (["evaluate", "--velocity", "nan"], "velocity must be a finite number, got nan"),
     (["evaluate", "--friction", "-0.5"], "friction must be >= 0, got -0.5"),
+    (["evaluate", "--latency-ms", "10"], "latency_ms must be whole control steps of 4 ms, got 10"),
+    (["evaluate", "--latency-ms", "-4"], "latency_ms must be >= 0, got -4.0"),
     (["evaluate", "--episodes", "0"], "episodes must be >= 1, got 0"),
     (["evaluate", "--num-envs", "0"], "num_envs must be >= 1, got 0"),
     (["evaluate", "--seed", "-1"], "seed must be >= 0, got -1"),

@@ -15,6 +15,7 @@ EXAMPLES = Path(__file__).parent.parent / "examples"
         ("04_place_the_base.py", "40 of 40 goals reached"),
         ("train_ddpg_her.py --rounds 2 --num-envs 2 --updates 2", "round    2: mean reward"),
         ("06_any_planner.py", "meet     mj_jac"),
+        ("05_real_time_loop.py", "plans came into use"),
     ],
 )
 def test_example_runs(name, says, tmp_path):

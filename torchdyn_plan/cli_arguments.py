@@ -14,6 +14,9 @@ PLANNERS = ("pursuit", "wait", "corner", "oracle", "exact", "meet")
 STATICS = ("ik", "rl")
 """Names of the static planners."""
 
+CONTROL_STEP_MS = 4
+"""Length of a control step [ms]."""
+
 SPLITS = ("test", "dev")
 """Series of episodes to evaluate on: tuning sees ``dev`` only."""
 
@@ -63,6 +66,14 @@ def _check_ball(velocity: float, friction: float) -> None:
     check_number("friction", friction, minimum=0.0)
 
 
+def _check_latency(latency_ms: float) -> None:
+    from torchdyn_plan.checks import check_number
+
+    check_number("latency_ms", latency_ms, minimum=0.0)
+    if latency_ms % CONTROL_STEP_MS:
+        raise InputError(f"latency_ms must be whole control steps of {CONTROL_STEP_MS} ms, got {latency_ms:g}")
+
+
 @dataclass(frozen=True, kw_only=True)
 class EvaluateArguments:
     """Run episodes at one velocity and friction with each planner; print a table and write the results."""
@@ -85,6 +96,10 @@ class EvaluateArguments:
     """Episodes that run side by side; does not change the results."""
     threads: int = 0
     """Threads of the simulation, 0 for all cores; does not change the results."""
+    latency_ms: float = 0.0
+    """Time by which every plan comes late, whole control steps of 4 ms; pursuit plans nothing and has none."""
+    compensate: bool = True
+    """Tell the planners of that time, so that they plan for the moment when the plan is there."""
     out: Path | None = None
     """Folder for results.json, episodes.json and the plot; nothing is written without it."""
 
@@ -92,9 +107,15 @@ class EvaluateArguments:
         with _as_usage_error():
             _check_names(self.planners, self.static, self.split)
             _check_ball(self.velocity, self.friction)
+            _check_latency(self.latency_ms)
             _check_counts(
                 episodes=(self.episodes, 1), seed=(self.seed, 0), num_envs=(self.num_envs, 1), threads=(self.threads, 0)
             )
+
+    @property
+    def latency_steps(self) -> int:
+        """`latency_ms` in control steps."""
+        return round(self.latency_ms / CONTROL_STEP_MS)
 
 
 @dataclass(frozen=True, kw_only=True)

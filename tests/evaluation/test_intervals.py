@@ -6,7 +6,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from torchdyn_plan.errors import InputError
-from torchdyn_plan.evaluation.intervals import Z_95, rate, wilson_interval
+from torchdyn_plan.evaluation.intervals import Z_95, paired_loss, rate, wilson_interval
 
 
 @pytest.mark.parametrize(
@@ -61,3 +61,16 @@ def test_no_trials_know_nothing():
 def test_impossible_counts_are_refused(successes, trials):
     with pytest.raises(InputError, match="successes must lie between 0 and trials"):
         rate(successes, trials)
+
+
+def test_a_paired_loss_counts_what_one_has_and_the_other_has_not():
+    before = torch.tensor([True] * 90 + [False] * 10)
+    after = torch.tensor([True] * 80 + [False] * 15 + [True] * 5)
+    loss = paired_loss(before, after)
+    assert loss.value == pytest.approx(0.05)
+    half = Z_95 * math.sqrt((15 / 100 - 0.05**2) / 100)
+    assert (loss.low, loss.high) == pytest.approx((0.05 - half, 0.05 + half))
+    assert paired_loss(before, before) == (0.0, 0.0, 0.0)
+    assert math.isnan(paired_loss(before[:0], before[:0]).value)
+    with pytest.raises(InputError, match=r"\(100,\) and \(3,\)"):
+        paired_loss(before, before[:3])

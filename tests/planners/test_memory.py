@@ -72,7 +72,7 @@ def test_a_reset_clears_the_planners_memory_and_leaves_the_static_planners_alone
     assert memory == {
         "window": [12, 10], "countdown": [3, 9], "replans": [0, 1], "arrival_steps": [0, td["arrival_steps"][1]],
         "clamped": [False, True], "reachable": [True, False], "replanned": [False, False], "path": [0, 1],
-        "status": [PlanStatus.WAITING, PlanStatus.UNREACHABLE],
+        "status": [PlanStatus.WAITING, PlanStatus.UNREACHABLE], "usable": [True, True],
     }  # fmt: skip
 
 

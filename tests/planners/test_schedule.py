@@ -5,6 +5,7 @@ import torch
 
 from torchdyn_plan.errors import InputError
 from torchdyn_plan.planners import ReplanSchedule
+from torchdyn_plan.planners.schedule import Drift, EventSchedule
 
 PAPER_STEPS = [13, 80, 140, 194, 242, 285, 323, 357, 387, 414, 439, 464, 489]
 PAPER_WINDOWS = [67, 60, 54, 48, 43, 38, 34, 30, 27, 25, 25, 25, 25]
@@ -79,3 +80,89 @@ def test_other_tasks_change_numbers_only():
 def test_bad_numbers_are_named(bad):
     with pytest.raises(InputError, match=f"{next(iter(bad))}.*{next(iter(bad.values()))}"):
         ReplanSchedule(**bad)
+
+
+class Looks:
+    """What a plan's drift is at each step, and the steps at which somebody looked."""
+
+    def __init__(self, miss=(), late=(), over=()):
+        self.miss, self.late, self.over, self.seen, self.now = miss, late, over, [], 0
+
+    def __call__(self, rows):
+        self.seen.append(self.now)
+        shape = rows.shape
+        return Drift(
+            torch.full(shape, 1.0 if self.now in self.miss else 0.0),
+            torch.full(shape, 9.0 if self.now in self.late else 0.0),
+            torch.full(shape, self.now in self.over),
+        )
+
+
+def watch(schedule, steps, looks, busy=()):
+    clock, due_at = None, []
+    for t in range(steps):
+        looks.now = t
+        clock, due = schedule.tick(clock, torch.tensor([t]), busy=torch.tensor([t in busy]), look=looks)
+        if due:
+            due_at.append(t)
+    return due_at
+
+
+EVENTS = EventSchedule(first_step=13, every=5, minimum=10, maximum=30, miss=0.5, late=5.0)
+
+
+def test_without_events_only_the_longest_time_counts():
+    looks = Looks()
+    assert watch(EVENTS, 80, looks) == [13, 43, 73]
+    assert looks.seen == [23, 28, 33, 38, 53, 58, 63, 68]
+
+
+@pytest.mark.parametrize("what", ["miss", "late", "over"])
+def test_an_event_is_answered_at_the_next_look_but_not_before_the_shortest_time(what):
+    assert watch(EVENTS, 60, Looks(**{what: range(14, 34)})) == [13, 23, 33]
+    assert watch(EVENTS, 60, Looks(**{what: [24]})) == [13, 43]
+    assert watch(EVENTS, 60, Looks(**{what: [28]})) == [13, 28, 58]
+
+
+def test_a_busy_row_plans_at_the_next_look():
+    assert watch(EVENTS, 60, Looks(miss=range(60)), busy=range(14, 25)) == [13, 28, 38, 48, 58]
+    assert watch(EVENTS, 60, Looks(), busy=range(40, 50)) == [13, 53]
+    every = ReplanSchedule.every(5, first_step=3)
+    assert watch(every, 30, Looks(), busy=[*range(4, 12), 13]) == [3, 18, 23, 28]
+
+
+def test_rows_with_events_leave_the_others_alone():
+    clock, got = None, [[], [], []]
+    for t in range(80):
+        step = torch.tensor([t, t, t % 40])
+
+        def look(rows, now=t):
+            return Drift(torch.tensor([1.0, 0.0, 0.0]) * (now == 28), torch.zeros(3), torch.zeros(3) > 1)
+
+        clock, due = EVENTS.tick(clock, step, look=look)
+        for row in due.nonzero().flatten().tolist():
+            got[row].append(t)
+    assert got == [[13, 28, 58], [13, 43, 73], [13, 53]]
+
+
+def test_every_few_steps():
+    assert run(ReplanSchedule.every(7, first_step=2), 24)[0] == [2, 9, 16, 23]
+    assert ReplanSchedule.every(7).longest == 7
+    assert ReplanSchedule().longest == 67
+
+
+@pytest.mark.parametrize(
+    "bad",
+    [
+        {"first_step": -1},
+        {"every": 0},
+        {"minimum": 7},
+        {"maximum": 52},
+        {"maximum": 4},
+        {"miss": -0.1},
+        {"late": math.nan},
+    ],
+)
+def test_a_bad_event_schedule_is_refused(bad):
+    with pytest.raises(InputError, match=f"{next(iter(bad))}.*{next(iter(bad.values()))}"):
+        EventSchedule(**bad)

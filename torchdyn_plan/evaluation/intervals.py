@@ -51,3 +51,19 @@ def rate(successes: int, trials: int) -> Rate:
     """The share ``successes / trials`` with its Wilson interval; NaN within [0, 1] when there are no trials."""
     low, high = wilson_interval(torch.tensor(successes), torch.tensor(trials))
     return Rate(successes / trials if trials else math.nan, low.item(), high.item())
+
+
+def paired_loss(before: Tensor, after: Tensor) -> Rate:
+    """Share of successes lost from ``before`` to ``after``, bool ``(E,)`` each, of the same episodes.
+
+    Between -1 and 1, with the normal approximation's 95 % interval of the mean of the differences: narrower than that
+    of two independent rates, as most episodes end alike. NaN within [-1, 1] for no episodes.
+    """
+    if before.shape != after.shape:
+        raise InputError(f"the episodes must be the same, got {tuple(before.shape)} and {tuple(after.shape)}")
+    lost = before.double() - after.double()
+    if not lost.numel():
+        return Rate(math.nan, -1.0, 1.0)
+    value = lost.mean().item()
+    half = Z_95 * math.sqrt(lost.square().mean().item() - value**2) / math.sqrt(lost.numel())
+    return Rate(value, max(value - half, -1.0), min(value + half, 1.0))

@@ -19,6 +19,7 @@ from torchdyn_plan.envs.episodes import draw_starts
 from torchdyn_plan.envs.scene import TrapperScene
 from torchdyn_plan.envs.trapper import MAX_STEPS, TrapperEnv
 from torchdyn_plan.evaluation.evidence import Evidence, find_evidence
+from torchdyn_plan.evaluation.latency import delay_plans
 from torchdyn_plan.evaluation.plots import plot_results
 from torchdyn_plan.evaluation.report import format_table
 from torchdyn_plan.evaluation.results import EpisodeOutcomes, summarize, write_results
@@ -83,6 +84,8 @@ def run_points(arguments: EvaluateArguments) -> dict[str, EpisodeOutcomes]:
     """Outcomes of the same episodes for each planner that ``arguments`` name."""
     with one_thread():
         planners = {name: PLANNERS[name](arguments.static) for name in arguments.planners}
+        for planner in planners.values():
+            delay_plans(planner, arguments.latency_steps, told=arguments.compensate)
         future, solvable = record_truth(arguments)
         return {name: run_episodes(planner, arguments, future, solvable, name) for name, planner in planners.items()}
 

@@ -14,7 +14,7 @@ from torchdyn_plan import keys
 from torchdyn_plan.checks import check_finite, check_number, check_trailing_shape
 from torchdyn_plan.planners.dynamic import DynamicPlanner
 from torchdyn_plan.planners.protocol import ArrivalPredictor, GoalSearch, StaticPlanner, keys_read, keys_written, read
-from torchdyn_plan.planners.schedule import ReplanSchedule
+from torchdyn_plan.planners.schedule import ReplanSchedule, Schedule
 from torchdyn_plan.planners.search import SearchResult
 
 if TYPE_CHECKING:
@@ -101,17 +101,19 @@ class OracleTrajectory(DynamicPlanner):
         eta: ArrivalPredictor,
         *,
         search: GoalSearch | None = None,
-        schedule: ReplanSchedule | None = None,
+        schedule: Schedule | None = None,
+        latency: int = 0,
         horizon: int = 300,
         chunk: int | None = None,
     ) -> None:
         """Join the parts as `DynamicPlanner` does; ``horizon`` [control steps] is as far as the search may look."""
-        super().__init__(static, RecordedFuture(horizon), eta, search=search, schedule=schedule, chunk=chunk)
+        truth = RecordedFuture(horizon)
+        super().__init__(static, truth, eta, search=search, schedule=schedule, latency=latency, chunk=chunk)
 
     @classmethod
-    def from_pretrained(cls, name: str, *, chunk: int | None = None) -> OracleTrajectory:
+    def from_pretrained(cls, name: str, *, latency: int = 0, chunk: int | None = None) -> OracleTrajectory:
         """The planner of that name with the recorded truth in place of its forecaster; raises what that one raises."""
         planner = DynamicPlanner.from_pretrained(name, chunk=chunk)
-        oracle = cls(planner.static, planner.eta, chunk=chunk)
+        oracle = cls(planner.static, planner.eta, latency=latency, chunk=chunk)
         oracle.gone_below = planner.gone_below
         return oracle.eval().requires_grad_(False)

@@ -13,12 +13,15 @@ from torch import Tensor
 
 from torchdyn_plan import keys
 from torchdyn_plan.checks import check_choice, check_number, check_same_device, check_trailing_shape
+from torchdyn_plan.nets.eta import Arrival
 from torchdyn_plan.planners.ik import IKPlanner
-from torchdyn_plan.planners.memory import MEMORY_KEYS, carry_on, recall, remember
+from torchdyn_plan.planners.latency import AtOnce, Delayed, Delivery, Job, Values, arrival_after, skip_steps
+from torchdyn_plan.planners.memory import MEMORY_KEYS, USABLE, carry_on, carry_use, recall, remember
+from torchdyn_plan.planners.outlook import OUTLOOK_NAMES, Outlook, cut, recall_outlook
 from torchdyn_plan.planners.policy import PolicyPlanner
 from torchdyn_plan.planners.protocol import ArrivalPredictor, GoalSearch, StaticPlanner, keys_read, keys_written, read
 from torchdyn_plan.planners.rows import apply_to_rows
-from torchdyn_plan.planners.schedule import ReplanSchedule
+from torchdyn_plan.planners.schedule import Drift, ReplanSchedule, Schedule
 from torchdyn_plan.planners.search import CornerSearch, SearchResult
 from torchdyn_plan.planners.status import held, input_status, plan_status, try_again, usable_forecast
 
@@ -47,6 +50,11 @@ class DynamicPlanner(TensorDictModuleBase):
     every step; other rows do not notice.
     """
 
+    keeps_outlook = False
+    """Whether it looks at the forecast between plans, whatever the schedule."""
+    own_names: tuple[str, ...] = ()
+    """What it remembers under ``plan`` beside its plans."""
+
     def __init__(
         self,
         static: StaticPlanner,
@@ -54,7 +62,8 @@ class DynamicPlanner(TensorDictModuleBase):
         eta: ArrivalPredictor,
         *,
         search: GoalSearch | None = None,
-        schedule: ReplanSchedule | None = None,
+        schedule: Schedule | None = None,
+        latency: int = 0,
         gone_below: float | None = None,
         chunk: int | None = None,
     ) -> None:
@@ -67,6 +76,7 @@ class DynamicPlanner(TensorDictModuleBase):
             eta: tells how long ``static`` needs to a goal.
             search: chooses the goal on the forecast; the paper's corner search by default.
             schedule: when to plan anew; the paper's by default.
+            latency: as `set_latency` takes it.
             gone_below: a target whose centre is lower has left the table [m, world]; None if it cannot.
             chunk: plan in blocks of exactly this many rows, so that results do not depend on the batch size.
         """
@@ -81,7 +91,24 @@ class DynamicPlanner(TensorDictModuleBase):
         self.seen_keys = tuple(getattr(forecaster, "in_keys", (keys.TARGET_HISTORY,)))
         state = (keys.ROBOT_STATE, keys.TARGET_POS, keys.TOOL_POS, keys.STEP_COUNT)
         self.in_keys = keys_read(static, *state, *self.seen_keys)
-        self.out_keys = keys_written(static, keys.GOAL, keys.ARRIVAL_STEPS, *MEMORY_KEYS)
+        self.set_latency(latency)
+
+    def set_latency(self, latency: int, delivery: Delivery | None = None) -> None:
+        """Plan for what will be in ``latency`` control steps, when a plan takes effect.
+
+        Until then the row goes on as planned before, and begins no other plan. The static planner has no latency: it
+        is a servo, and acts at every step on the goal of the plan in use.
+
+        Args:
+            latency: from seeing to acting on it.
+            delivery: how plans come into use; after ``latency`` steps by default.
+        """
+        check_number("latency", latency, minimum=0, integer=True)
+        self.latency = latency
+        self.delivery: Delivery = delivery or (Delayed(latency) if latency else AtOnce())
+        names = self._value_names[len(SearchResult._fields) :] + self.delivery.keys(self._value_names)
+        own = [(keys.PLAN, name) for name in (*names, *self.own_names)]
+        self.out_keys = keys_written(self.static, keys.GOAL, keys.ARRIVAL_STEPS, *MEMORY_KEYS, *own)
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         """Plan where a plan is due, and act.
@@ -89,34 +116,111 @@ class DynamicPlanner(TensorDictModuleBase):
         Raises:
             InputError: a key is missing, a shape is wrong, or data and networks are on different devices.
         """
-        tool_pos, target_pos, robot_state, step_count, *seen = self._read(tensordict)
-        memory = recall(tensordict)
-        clock, due = self.schedule.tick(None if memory is None else memory.clock, step_count)
-        meeting = carry_on(memory, tool_pos, step_count)
-        trouble = input_status(target_pos, seen, self.gone_below)
-        able = due & (trouble == 0)
-        *planned, usable = apply_to_rows(
-            self._plan_rows, able, (robot_state, target_pos, *seen), (*meeting, able), chunk=self.chunk
-        )
-        failed = due & ~usable
-        meeting = held(SearchResult(*planned), failed, tool_pos)
-        clock = try_again(clock, failed, memory, self.schedule, step_count)
-        status = plan_status(trouble, failed, clock, meeting.reachable)
-        remember(tensordict, clock, meeting, replanned=due & usable, status=status)
+        self._replan(tensordict, *self._read(tensordict))
         return self.static(tensordict)
 
     def plan(self, robot_state: Tensor, target_pos: Tensor, *seen: Tensor) -> SearchResult:
         """Forecast and choose a meeting, for robot states (*B, S), targets (*B, 3) and what the forecaster reads."""
-        return self._choose(self.forecaster(*seen), robot_state, target_pos)
+        forecast, target_pos = skip_steps(self.forecaster(*seen), target_pos, self.latency)
+        return self._choose(robot_state, forecast, target_pos)
 
-    def _plan_rows(self, robot_state: Tensor, target_pos: Tensor, *seen: Tensor) -> tuple[Tensor, ...]:
-        """`plan`, whatever the forecaster returns, and whether that was of any use, ``(R,)``."""
+    def plan_ahead(
+        self, robot_state: Tensor, target_pos: Tensor, tool_pos: Tensor, planned_steps: Tensor, *seen: Tensor
+    ) -> tuple[Tensor, ...]:
+        """Forecast and choose a meeting.
+
+        Args:
+            robot_state: ``(R, S)``.
+            target_pos: ``(R, 3)`` [m, world].
+            tool_pos: ``(R, 3)`` [m, world].
+            planned_steps: ``(R,)`` control steps to the meeting planned before, from when the plan takes effect.
+            seen: what the forecaster reads.
+
+        Returns:
+            A `SearchResult`'s entries, whether the forecast was of any use ``(R,)``, and the outlook and its age if it
+            is kept.
+        """
         forecast, usable = usable_forecast(self.forecaster(*seen), target_pos)
-        return *self._choose(forecast, robot_state, target_pos), usable
+        forecast, target_pos = skip_steps(forecast, target_pos, self.latency)
+        meeting = self._choose(robot_state, forecast, target_pos, tool_pos=tool_pos, planned_steps=planned_steps)
+        return (*meeting, usable, *self._outlook(forecast, target_pos))
 
-    def _choose(self, forecast: Tensor, robot_state: Tensor, target_pos: Tensor) -> SearchResult:
-        eta = partial(self.eta.arrival, robot_state.unsqueeze(-2))
-        return self.search(forecast, target_pos, eta)
+    def _choose(
+        self, robot_state: Tensor, forecast: Tensor, target_pos: Tensor, **tool_and_plan: Tensor
+    ) -> SearchResult:
+        """A meeting on the forecast from when the plan takes effect; the paper's search knows nothing of the tool."""
+        return self.search(forecast, target_pos, self._arrival(robot_state))
+
+    def _arrival(self, robot_state: Tensor) -> Callable[..., Arrival]:
+        """Maps goals (*B, K, 3) to arrivals from when the plan takes effect."""
+        return arrival_after(partial(self.eta.arrival, robot_state.unsqueeze(-2)), self.latency)
+
+    def _outlook(self, forecast: Tensor, target_pos: Tensor) -> tuple[Tensor, ...]:
+        """What is kept of a forecast, ``(R, T, 3)``, and its age, 0; nothing where nobody looks at it."""
+        if not self._with_outlook:
+            return ()
+        age = torch.zeros(target_pos.shape[:-1], dtype=torch.int64, device=target_pos.device)
+        return cut(forecast, target_pos, self.outlook_steps), age
+
+    @property
+    def outlook_steps(self) -> int:
+        """Positions kept from a forecast: until the next plan is there, were it due while another is under way."""
+        return self.schedule.longest + 2 * self.latency + 1
+
+    @property
+    def _with_outlook(self) -> bool:
+        return self.keeps_outlook or self.schedule.watches
+
+    @property
+    def _value_names(self) -> tuple[str, ...]:
+        """What a plan consists of: a meeting, whether its forecast was of use, and an outlook if it is kept."""
+        return (*SearchResult._fields, USABLE, *(OUTLOOK_NAMES if self._with_outlook else ()))
+
+    def _replan(
+        self, tensordict: TensorDictBase, tool_pos: Tensor, target_pos: Tensor, robot_state: Tensor,
+        step_count: Tensor, *seen: Tensor,
+    ) -> tuple[SearchResult, Outlook | None, Tensor]:  # fmt: skip
+        """Take up what has arrived, plan where a plan is due, and remember.
+
+        Returns:
+            The meeting and the outlook in use, and ``(*B,)`` bool: the rows that have to hold.
+        """
+        memory, kept = recall(tensordict), tensordict.get(keys.PLAN, None)
+        used = (*carry_on(memory, tool_pos, step_count), carry_use(tensordict, step_count))
+        if self._with_outlook:
+            used += recall_outlook(tensordict, target_pos, step_count, self.outlook_steps)
+        values, busy = self.delivery.arrive(kept, dict(zip(self._value_names, used, strict=True)), step_count)
+        look = partial(self._look, values, target_pos, robot_state)
+        clock, due = self.schedule.tick(None if memory is None else memory.clock, step_count, busy=busy, look=look)
+        trouble = input_status(target_pos, seen, self.gone_below)
+        able = due & (trouble == 0)
+        planned_steps = (values["arrival_steps"] - self.latency).clamp_min(0)
+        inputs = (robot_state, target_pos, tool_pos, planned_steps, *seen)
+        job = Job(self.plan_ahead, able, inputs, step_count, self.chunk)
+        values, pending = self.delivery.order(job, kept, values)
+        goal, arrival_steps, clamped, reachable, usable, *outlook = values.values()
+        failed = due & ~(able & pending.get(f"pending_{USABLE}", usable))
+        holds = (due & ~able) | ~usable
+        meeting = held(SearchResult(goal, arrival_steps, clamped, reachable), holds, tool_pos)
+        clock = try_again(clock, failed, memory, self.schedule, step_count)
+        status = plan_status(trouble, ~usable, clock, meeting.reachable)
+        others = {USABLE: usable, **dict(zip(OUTLOOK_NAMES, outlook)), **pending}  # noqa: B905
+        remember(tensordict, clock, meeting, replanned=due & ~failed, status=status, **others)
+        return meeting, Outlook(*outlook) if outlook else None, holds
+
+    def _look(self, values: Values, target_pos: Tensor, robot_state: Tensor, rows: Tensor) -> Drift:
+        """How far the plan in use has drifted, in ``rows`` (*B,)."""
+        steps, outlook = values["arrival_steps"], Outlook(values["outlook"], values["outlook_age"])
+        miss = torch.linalg.vector_norm(outlook.ahead(1).squeeze(-2) - target_pos, dim=-1)
+        inputs = (robot_state, values["goal"], steps)
+        (late,) = apply_to_rows(self._late, rows, inputs, (torch.zeros_like(miss),), chunk=self.chunk)
+        return Drift(miss, late, steps == 0)
+
+    def _late(self, robot_state: Tensor, goal: Tensor, planned_steps: Tensor) -> tuple[Tensor]:
+        """Predicted steps to the goal less the planned ones, ``(R,)``."""
+        arrival = self.eta.arrival(robot_state.unsqueeze(-2), goal.unsqueeze(-2), reading="expectation")
+        needed = arrival.steps.masked_fill(arrival.never, torch.inf).squeeze(-1)
+        return (needed - planned_steps,)
 
     def _read(self, tensordict: TensorDictBase) -> list[Tensor]:
         """Tool and target (*B, 3) [m, world], robot state (*B, S), step count (*B,), and what the forecaster reads."""
@@ -139,8 +243,10 @@ class DynamicPlanner(TensorDictModuleBase):
             check_trailing_shape(keys.TARGET_HISTORY, history, length, 3)
 
     @classmethod
-    def from_pretrained(cls, name: str, *, chunk: int | None = None) -> DynamicPlanner:
+    def from_pretrained(cls, name: str, *, latency: int = 0, chunk: int | None = None) -> DynamicPlanner:
         """A planner with the weights that ship with the package: ``"trapper-ik"`` or ``"trapper-rl"``.
+
+        ``latency`` is as in `set_latency`.
 
         Raises:
             InputError: there is no planner of that name; the message lists those there are.
@@ -151,6 +257,6 @@ class DynamicPlanner(TensorDictModuleBase):
 
         static, forecaster, eta = PRETRAINED[name]
         networks = Forecaster.from_pretrained(forecaster), ETANetwork.from_pretrained(eta)
-        planner = cls(STATIC_PLANNERS[static](chunk=chunk), *networks, chunk=chunk)
+        planner = cls(STATIC_PLANNERS[static](chunk=chunk), *networks, latency=latency, chunk=chunk)
         planner.gone_below = SUNK
         return planner.eval().requires_grad_(False)

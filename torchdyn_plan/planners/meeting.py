@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from functools import partial
-from typing import Any
 
 import torch
 from tensordict import TensorDict, TensorDictBase
@@ -15,14 +13,12 @@ from torchdyn_plan.checks import check_number
 from torchdyn_plan.planners.drop import Drop
 from torchdyn_plan.planners.dynamic import SUNK, DynamicPlanner
 from torchdyn_plan.planners.exact import ExactSearch
-from torchdyn_plan.planners.memory import carry_on, recall, remember
+from torchdyn_plan.planners.latency import where_rows
 from torchdyn_plan.planners.protocol import ArrivalPredictor, StaticPlanner
-from torchdyn_plan.planners.rows import apply_to_rows
-from torchdyn_plan.planners.schedule import ReplanSchedule
+from torchdyn_plan.planners.schedule import ReplanSchedule, Schedule
 from torchdyn_plan.planners.search import SearchResult
-from torchdyn_plan.planners.status import held, input_status, plan_status, try_again, usable_forecast
 
-DROP_NAMES = ("outlook", "outlook_age", "drop_step", "tool_before")
+DROP_NAMES = ("drop_step", "tool_before")
 
 FOLLOW_AFTER = 2
 """Control steps that a box goes straight down before it follows the target."""
@@ -43,6 +39,8 @@ class MeetingPlanner(DynamicPlanner):
     begun goes on.
     """
 
+    keeps_outlook, own_names = True, DROP_NAMES
+
     def __init__(
         self,
         static: StaticPlanner,
@@ -50,7 +48,8 @@ class MeetingPlanner(DynamicPlanner):
         eta: ArrivalPredictor,
         *,
         search: ExactSearch | None = None,
-        schedule: ReplanSchedule | None = None,
+        schedule: Schedule | None = None,
+        latency: int = 0,
         drop: Drop | None = None,
         table_height: float = 0.042,
         pull: float = 0.044,
@@ -67,6 +66,7 @@ class MeetingPlanner(DynamicPlanner):
             search: chooses where to wait, and when for.
             schedule: when to plan anew; every 5 steps from step 13 by default. A multiple of the search's stride keeps
                 its candidates on the same places of the path, and so the tool still while it waits.
+            latency: as for `DynamicPlanner`. Whether to drop is decided at every step, on the forecast in use.
             drop: sizes and the descent of ``static``.
             table_height: height of a goal that brings the box down [m].
             pull: the goal of a dropping box is at most so far from it, sideways [m].
@@ -74,95 +74,64 @@ class MeetingPlanner(DynamicPlanner):
             gone_below: as for `DynamicPlanner`.
             chunk: plan in blocks of exactly this many rows, so that results do not depend on the batch size.
         """
-        schedule = schedule or ReplanSchedule(window=5, shrink=1.0, minimum=5)
+        schedule = schedule or ReplanSchedule.every(5)
         super().__init__(
-            static, forecaster, eta, search=search or WAITING, schedule=schedule, gone_below=gone_below, chunk=chunk
+            static,
+            forecaster,
+            eta,
+            search=search or WAITING,
+            schedule=schedule,
+            latency=latency,
+            gone_below=gone_below,
+            chunk=chunk,
         )
         self.search: ExactSearch
         self.drop, self.table_height, self.pull, self.lead = drop or Drop(), table_height, pull, lead
         check_number("lead", lead, minimum=0, maximum=self.drop.outlook - 1, integer=True)
         for name, value in (("table_height", table_height), ("pull", pull)):
             check_number(name, value, minimum=0.0)
-        written: list[Any] = list(self.out_keys)
-        self.out_keys = written + [(keys.PLAN, name) for name in DROP_NAMES]
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         """Plan where a plan is due, wait or drop, and act; raises what `DynamicPlanner.forward` raises."""
         tool_pos, target_pos, robot_state, step_count, *seen = self._read(tensordict)
-        memory = recall(tensordict)
-        clock, due = self.schedule.tick(None if memory is None else memory.clock, step_count)
-        meeting = carry_on(memory, tool_pos, step_count)
-        outlook, age, drop_step, tool_before = self._recall_drop(tensordict, tool_pos, target_pos, step_count)
-        trouble = input_status(target_pos, seen, self.gone_below)
-        able = due & (trouble == 0)
-        outputs = (*meeting, outlook, age, able)
-        inputs = (robot_state, target_pos, tool_pos, meeting.arrival_steps, *seen)
-        *planned, outlook, age, usable = apply_to_rows(self.plan_ahead, able, inputs, outputs, chunk=self.chunk)
-        failed = due & ~usable
-        meeting = held(SearchResult(*planned), failed, tool_pos)
-        clock = try_again(clock, failed, memory, self.schedule, step_count)
-
-        path = self._path(outlook, age)
+        drop_step, tool_before = self._recall_drop(tensordict, tool_pos, step_count)
+        meeting, outlook, holds = self._replan(tensordict, tool_pos, target_pos, robot_state, step_count, *seen)
+        assert outlook is not None
+        path = outlook.ahead(self.drop.outlook)
+        # When plans stay away, what is known of the path ends too soon to begin a drop.
+        known = (outlook.age >= 0) & (outlook.age + self.drop.outlook <= outlook.path.shape[-2])
         drop_step = self._drop_step(
             drop_step, path, tool_pos=tool_pos, tool_before=tool_before, target_pos=target_pos,
-            started=(clock.replans > 0) & ~failed,
+            known=known & ~holds,
         )  # fmt: skip
-        status = plan_status(trouble, failed, clock, meeting.reachable)
-        remember(tensordict, clock, meeting, replanned=due & usable, status=status)
-        entries = dict(zip(DROP_NAMES, (outlook, age + 1, drop_step, tool_pos), strict=True))
+        entries = dict(zip(DROP_NAMES, (drop_step, tool_pos), strict=True))
         plan = tensordict.get(keys.PLAN)
         plan.update(TensorDict(entries, tensordict.batch_size, device=tensordict.device))
         tensordict.set(keys.GOAL, self._goal(meeting, path, tool_pos, drop_step))
         return self.static(tensordict)
 
-    def plan_ahead(
-        self, robot_state: Tensor, target_pos: Tensor, tool_pos: Tensor, planned_steps: Tensor, *seen: Tensor
-    ) -> tuple[Tensor, ...]:
-        """Forecast and choose a meeting: a `SearchResult`'s entries, outlook, its age (0), and the forecast's use.
-
-        Args:
-            robot_state: ``(R, S)``.
-            target_pos: ``(R, 3)`` [m, world].
-            tool_pos: ``(R, 3)`` [m, world].
-            planned_steps: ``(R,)`` control steps from now to the meeting planned before.
-            seen: what the forecaster reads.
-        """
-        known, usable = usable_forecast(self.forecaster(*seen), target_pos)
-        eta = partial(self.eta.arrival, robot_state.unsqueeze(-2))
-        found = self.search(known, target_pos, eta, tool_pos=tool_pos, planned_steps=planned_steps)
-        path = torch.cat([target_pos.unsqueeze(-2), known], dim=-2)
-        ahead = torch.arange(self._outlook, device=path.device).clamp(max=path.shape[-2] - 1)
-        return (
-            *found, path[..., ahead, :], torch.zeros_like(found.arrival_steps), usable,
-        )  # fmt: skip
+    def _choose(
+        self, robot_state: Tensor, forecast: Tensor, target_pos: Tensor, **tool_and_plan: Tensor
+    ) -> SearchResult:
+        """A place to wait at, which also depends on where the tool is and on the meeting planned before."""
+        return self.search(forecast, target_pos, self._arrival(robot_state), **tool_and_plan)
 
     @property
-    def _outlook(self) -> int:
-        """Positions kept from a forecast: those that a drop looks at before the next plan is due, or a little later."""
-        return self.drop.outlook + 8
+    def outlook_steps(self) -> int:
+        """Positions kept from a forecast: those that a drop looks at before the next plan is there, or a little later.
 
-    def _recall_drop(
-        self, tensordict: TensorDictBase, tool_pos: Tensor, target_pos: Tensor, step_count: Tensor
-    ) -> tuple[Tensor, ...]:
-        """Outlook (*B, T, 3) and its age, steps since a drop began (-1: none), and the tool a step ago (*B, 3)."""
-        nothing = target_pos.unsqueeze(-2).expand(*target_pos.shape[:-1], self._outlook, 3)
-        zero = torch.zeros_like(step_count)
-        start = (nothing, zero, zero - 1, tool_pos)
-        plan = tensordict.get(keys.PLAN, None)
-        if plan is None or plan.get(DROP_NAMES[0], None) is None:
-            return start
+        A plan that is due while another is under way waits for the next window.
+        """
+        return self.drop.outlook + max(8, self.schedule.longest) + 2 * self.latency
+
+    def _recall_drop(self, tensordict: TensorDictBase, tool_pos: Tensor, step_count: Tensor) -> tuple[Tensor, Tensor]:
+        """Steps since a drop began (-1: none) ``(*B,)``, and the tool a step ago ``(*B, 3)``."""
+        none, plan = torch.full_like(step_count, -1), tensordict.get(keys.PLAN, None)
+        drop_step = None if plan is None else plan.get(DROP_NAMES[0], None)
+        if plan is None or drop_step is None:
+            return none, tool_pos
         fresh = step_count == 0
-        old = map(plan.get, DROP_NAMES)
-        return tuple(
-            torch.where(fresh[(..., *[None] * (new.ndim - fresh.ndim))], new, value)
-            for new, value in zip(start, old, strict=True)
-        )
-
-    def _path(self, outlook: Tensor, age: Tensor) -> Tensor:
-        """The outlook from now on, ``(*B, drop.outlook, 3)``; its last position is repeated beyond its end."""
-        ahead = torch.arange(self.drop.outlook, device=age.device)
-        index = (age.unsqueeze(-1) + ahead).clamp(max=outlook.shape[-2] - 1)
-        return outlook.gather(-2, index.unsqueeze(-1).expand(*index.shape, 3))
+        return torch.where(fresh, none, drop_step), where_rows(fresh, tool_pos, plan.get(DROP_NAMES[1]))
 
     def _drop_step(
         self,
@@ -172,7 +141,7 @@ class MeetingPlanner(DynamicPlanner):
         tool_pos: Tensor,
         tool_before: Tensor,
         target_pos: Tensor,
-        started: Tensor,
+        known: Tensor,
     ) -> Tensor:
         """Steps since the drop began, -1 for none: begins when it is best to begin now, ends when it has missed."""
         drop = self.drop
@@ -180,7 +149,7 @@ class MeetingPlanner(DynamicPlanner):
         clearance = drop.clearance(path, tool_pos, tool_pos - tool_before)
         now = (clearance.argmax(-1) == 0) & (clearance[..., 0] > 0.0)
         above = (tool_pos[..., 2] > 0.95 * 2 * drop.radius) & (path[..., 2] > 0.0).all(-1)
-        step = torch.where((step < 0) & started & now & above, 0, step)
+        step = torch.where((step < 0) & known & now & above, 0, step)
         outside = (target_pos - tool_pos)[..., :2].abs().amax(-1) > drop.half_width + 0.01
         down = tool_pos[..., 2] < 1.2 * drop.radius
         return torch.where(outside & (step > 8) & (down | (step > 40)), -1, step)

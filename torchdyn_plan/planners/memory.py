@@ -13,7 +13,9 @@ from torchdyn_plan.planners.schedule import Clock
 from torchdyn_plan.planners.search import SearchResult
 
 MEMORY_NAMES = (*Clock._fields, *SearchResult._fields, "replanned", "status")
-MEMORY_KEYS: tuple[NestedKey, ...] = tuple((keys.PLAN, name) for name in MEMORY_NAMES)
+USABLE = "usable"
+"""Whether the forecast, from which the plan in use was made, was of any use."""
+MEMORY_KEYS: tuple[NestedKey, ...] = tuple((keys.PLAN, name) for name in (*MEMORY_NAMES, USABLE))
 
 
 class Memory(NamedTuple):
@@ -32,12 +34,19 @@ def recall(tensordict: TensorDictBase) -> Memory | None:
 
 
 def remember(
-    tensordict: TensorDictBase, clock: Clock, meeting: SearchResult, *, replanned: Tensor, status: Tensor
+    tensordict: TensorDictBase,
+    clock: Clock,
+    meeting: SearchResult,
+    *,
+    replanned: Tensor,
+    status: Tensor,
+    **others: Tensor,
 ) -> None:
     """Write the memory, and ``goal`` and ``arrival_steps`` for everybody to read, into ``tensordict``."""
     plan = tensordict.get(keys.PLAN, None)
     entries = {} if plan is None else dict(plan.items())
     entries.update(zip(MEMORY_NAMES, (*clock, *meeting, replanned, status), strict=True))
+    entries.update(others)
     # A new one each step: tensordicts of earlier steps may share the old one.
     tensordict.set(keys.PLAN, TensorDict(entries, tensordict.batch_size, device=tensordict.device))
     tensordict.set(keys.GOAL, meeting.goal)
@@ -63,3 +72,10 @@ def carry_on(memory: Memory | None, tool_pos: Tensor, step_count: Tensor) -> Sea
         old.clamped & ~fresh,
         old.reachable | fresh,
     )
+
+
+def carry_use(tensordict: TensorDictBase, step_count: Tensor) -> Tensor:
+    """Whether the plan in use came from a usable forecast, ``(*B,)``; true where there is none yet."""
+    plan = tensordict.get(keys.PLAN, None)
+    usable = None if plan is None else plan.get(USABLE, None)
+    return torch.ones_like(step_count, dtype=torch.bool) if usable is None else usable | (step_count == 0)

@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 
 from torchdyn_plan.planners.memory import Memory
-from torchdyn_plan.planners.schedule import Clock, ReplanSchedule
+from torchdyn_plan.planners.schedule import Clock, Schedule
 from torchdyn_plan.planners.search import SearchResult
 
 FARTHEST = 1e3
@@ -72,9 +72,7 @@ def held(meeting: SearchResult, failed: Tensor, tool_pos: Tensor) -> SearchResul
     )
 
 
-def try_again(
-    clock: Clock, failed: Tensor, memory: Memory | None, schedule: ReplanSchedule, step_count: Tensor
-) -> Clock:
+def try_again(clock: Clock, failed: Tensor, memory: Memory | None, schedule: Schedule, step_count: Tensor) -> Clock:
     """``clock``, but rows that ``failed`` (*B,) to plan are due again at the next step, as if not due at this one."""
     window = schedule.start(step_count).window
     if memory is not None:
