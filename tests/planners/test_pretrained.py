@@ -4,8 +4,8 @@ import torch
 from tests.planners.toy import assert_same
 from torchdyn_plan.envs import TrapperEnv
 from torchdyn_plan.errors import InputError, WeightsError
-from torchdyn_plan.nets import ETANetwork, Forecaster, pretrained
-from torchdyn_plan.planners import DynamicPlanner, IKPlanner, OracleTrajectory
+from torchdyn_plan.nets import Actor, ETANetwork, Forecaster, pretrained
+from torchdyn_plan.planners import DynamicPlanner, IKPlanner, OracleTrajectory, PolicyPlanner
 
 
 @pytest.fixture
@@ -39,6 +39,19 @@ def test_a_planner_by_name_is_the_one_put_together_from_its_parts(shipped, due):
     assert_same(one, other)
     assert isinstance(planner.static, IKPlanner)
     assert (planner.chunk, planner.static.chunk) == (4, 4)
+
+
+def test_a_learned_policy_comes_with_its_own_arrival_times(shipped, due):
+    torch.manual_seed(6)
+    actor, eta = Actor(hidden=8), ETANetwork(hidden=8)
+    actor.save_pretrained(shipped[0] / "policy-trapper.safetensors")
+    eta.save_pretrained(shipped[0] / "eta-trapper-rl.safetensors")
+    planner = DynamicPlanner.from_pretrained("trapper-rl")
+    by_hand = DynamicPlanner(PolicyPlanner(actor.eval()), shipped[1][0].eval(), eta.eval())
+    with torch.no_grad():
+        one, other = planner(due.clone()), by_hand(due.clone())
+    assert_same(one, other)
+    assert isinstance(planner.static, PolicyPlanner)
 
 
 def test_it_is_ready_to_run_and_not_to_train(shipped):
