@@ -1,6 +1,7 @@
 """The command line. What a command works with is imported when the command runs, so that help answers at once."""
 
 import importlib
+import inspect
 import sys
 from collections.abc import Callable, Sequence
 from typing import Annotated, Any
@@ -74,7 +75,8 @@ def bench(arguments: BenchArguments) -> None:
         if arguments.out.is_dir():
             raise OutputError(f"output file {str(arguments.out)!r} is a folder")
     benchmark = importlib.import_module(BENCHMARKS[arguments.name])
-    rows = benchmark.bench()
+    compiled = {"compiled": arguments.compiled} if "compiled" in inspect.signature(benchmark.bench).parameters else {}
+    rows = benchmark.bench(**compiled)
     for row in rows:
         print("  ".join(f"{name} {value}" for name, value in row.items()))
     if arguments.out is not None:

@@ -264,6 +264,8 @@ class BenchArguments:
     """What to measure: replan (latency of a re-plan), env (rate of the simulation) or kinematics (beside others')."""
     out: Path | None = None
     """JSON file for the figures; a plot, where there is one, is put beside it."""
+    compiled: bool = True
+    """Measure compiled forms too, where there are any: they take minutes to compile."""
 
     def __post_init__(self) -> None:
         from torchdyn_plan.checks import check_choice

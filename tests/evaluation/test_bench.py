@@ -2,6 +2,7 @@ import pytest
 import torch
 
 from torchdyn_plan.evaluation import bench_env, bench_replan
+from torchdyn_plan.evaluation.replan_parts import in_blocks, steps
 from torchdyn_plan.evaluation.run import EpisodeLog, play
 from torchdyn_plan.evaluation.timing import figures, sample
 from torchdyn_plan.nets import ETANetwork, Forecaster
@@ -65,22 +66,36 @@ def test_a_tape_that_lacks_a_reset_shows_as_an_error(monkeypatch):
 
 
 def test_a_replan_is_measured_in_its_parts_and_a_batch_equals_its_rows(planner):
-    rows = bench_replan.bench(planner, batches=(1, 5), seconds=0.0)
-    names = [row["what"] for row in rows if row["batch"] == 5 and row["device"] == "cpu"]
-    assert names == [
-        "re-plan", "re-plan, exact search", "forecaster", "ETA, 1 goal", "ETA, 4 goals", "search alone",
-        "IK path of 5 steps", "planner step that plans", "planner step between plans",
-    ]  # fmt: skip
+    rows = bench_replan.bench(planner, batches=(1, 5), seconds=0.0, compiled=False)
+    names = [(row["what"], row["implementation"]) for row in rows if row["batch"] == 5 and row["device"] == "cpu"]
+    both = ["forecast", "ETA, 1 goal", "ETA, 4 goals", "ETA, 60 goals"]
+    both += ["re-plan, corner", "re-plan, exact", "re-plan, exact, coarse to fine", "re-plan, meet"]
+    alone = ["search alone, corner", "search alone, exact", "search alone, exact, coarse to fine"]
+    alone += ["IK path of 5 steps", "planner step that plans", "planner step between plans"]
+    assert names == [(name, "torchdyn_plan") for name in both + alone] + [(n, "torchdyn_plan, folded") for n in both]
     for row in rows:
-        assert row.keys() >= COLUMNS
+        assert row.keys() >= COLUMNS | {"per_second"}
+        assert not row["compiled"]
         assert row["max_error"] < 1e-3, row
         assert row["median_us"] > 0.0
 
 
 def test_rows_that_depend_on_their_batch_show_as_an_error():
     seen = bench_replan.observations(4)
-    assert bench_replan._error(lambda td: (td["goal"] - td["goal"].mean(dim=0),), seen) > 1e-3
-    assert bench_replan._error(lambda td: (td["goal"] * 2.0,), seen) == 0.0
+    once, twice = lambda td: (td["goal"] - td["goal"].mean(dim=0),), lambda td: (td["goal"] * 2.0,)
+    assert bench_replan._error(once, once, seen) > 1e-3
+    assert bench_replan._error(twice, once, seen) > 1e-3
+    assert bench_replan._error(twice, twice, seen) == 0.0
+
+
+def test_more_rows_than_a_block_are_worked_on_block_by_block():
+    sizes = []
+    part = lambda one, other: (sizes.append(len(one)), (one + other, other))[1]  # noqa: E731
+    found = in_blocks(part, 4, torch.arange(10), torch.ones(10))
+    assert sizes == [4, 4, 2]
+    assert torch.equal(found[0], torch.arange(1, 11))
+    in_blocks(part, 10, torch.arange(10), torch.ones(10))
+    assert sizes[3:] == [10]
 
 
 def test_the_planner_step_that_plans_plans_and_the_other_does_not(planner, monkeypatch):
@@ -89,8 +104,9 @@ def test_the_planner_step_that_plans_plans_and_the_other_does_not(planner, monke
     monkeypatch.setattr(DynamicPlanner, "plan", lambda self, *seen: (calls.append(0), plan(self, *seen))[1])
     seen = bench_replan.observations(3)
     seen.set("plan", planner(seen.copy())["plan"])
-    parts = bench_replan._parts(planner)
+    parts = steps(planner)
     for what, planned in (("planner step between plans", 0), ("planner step that plans", 1)):
         calls.clear()
-        parts[what](seen)
+        part, inputs = parts[what]
+        part(*inputs(seen))
         assert len(calls) == planned

@@ -205,3 +205,50 @@ BAD += [(name, -0.5) for name in ("lead", "margin", "footprint", "patience", "lo
 def test_a_bad_setting_is_named(name, value):
     with pytest.raises(InputError, match=f"{name}.*{value}"):
         ExactSearch(**{name: value})
+
+
+def test_with_a_perfect_forecast_and_arrivals_the_true_meeting_time_is_found():
+    # |p + v t| = 0.01 t has its first root t in closed form; the search answers with the next whole step.
+    draw = torch.Generator().manual_seed(1)
+    start, velocity = torch.rand(2, 300, 2, generator=draw, dtype=torch.float64) - 0.5
+    velocity *= 0.03
+    ahead = torch.arange(201.0, dtype=torch.float64).view(-1, 1)
+    path = torch.nn.functional.pad(start.unsqueeze(1) + velocity.unsqueeze(1) * ahead, (0, 1), value=HEIGHT)
+    a, b, c = velocity.square().sum(-1) - 1e-4, (start * velocity).sum(-1), start.square().sum(-1)
+    root = torch.stack([(-b - (b * b - a * c).sqrt()) / a, (-b + (b * b - a * c).sqrt()) / a])
+    root = torch.where(root > 0, root, torch.inf).nan_to_num(nan=torch.inf).amin(0)
+    found = ExactSearch(stride=1)(path[:, 1:], path[:, 0], robot(reach=9.0)[0])
+    met = root <= 200
+    assert 100 < met.sum() < 300
+    assert torch.equal(found.reachable, met)
+    assert torch.equal(found.arrival_steps[met], root[met].ceil().clamp_min(2).long())
+
+
+def same(one, other):
+    return (one.arrival_steps == other.arrival_steps) & (one.reachable == other.reachable)
+
+
+@pytest.mark.parametrize("coarse", [2, 3, 4, 7])
+def test_coarse_to_fine_finds_the_first_crossing_with_few_questions(coarse):
+    draw = torch.Generator().manual_seed(1)
+    start, velocity = torch.rand(2, 60, 1, 3, generator=draw) - 0.5
+    start[..., 2], velocity[..., 2] = HEIGHT, 0.0
+    path = start + 0.015 * velocity * torch.arange(301.0).unsqueeze(-1)
+    eta, asked = robot(reach=9.0)
+    whole = ExactSearch()(path[:, 1:], path[:, 0], robot(reach=9.0)[0])
+    found = ExactSearch(coarse=coarse)(path[:, 1:], path[:, 0], eta)
+    assert [shape[1] for shape, _ in asked] == [-(-60 // coarse), coarse + 1]
+    assert whole.reachable.any()
+    # A short stretch in time between two that are asked for first may be missed: the meeting is then a later one.
+    alike = same(found, whole)[whole.reachable]
+    assert alike.double().mean() > 0.9
+    later = (found.arrival_steps >= whole.arrival_steps) | ~found.reachable
+    assert bool(later[whole.reachable].all())
+    assert torch.equal(found.goal[whole.reachable][alike], whole.goal[whole.reachable][alike])
+
+
+@pytest.mark.parametrize("horizon", [1, 2, 6, 11])
+def test_coarse_to_fine_works_on_short_forecasts(horizon):
+    forecast, here = paths(30, horizon=horizon)
+    found, whole = (ExactSearch(stride=2, coarse=n)(forecast, here, robot()[0]) for n in (4, 1))
+    assert bool(same(found, whole)[whole.reachable].all())

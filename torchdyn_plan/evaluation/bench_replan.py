@@ -1,4 +1,4 @@
-"""Latency of a re-plan, of its parts, and of a whole planner step around it."""
+"""Latency and throughput of a re-plan, of its parts, and of a whole planner step around it."""
 
 from __future__ import annotations
 
@@ -12,62 +12,101 @@ from torch import Tensor
 
 from torchdyn_plan import keys
 from torchdyn_plan.envs.scene import TrapperScene
+from torchdyn_plan.evaluation.replan_parts import Inputs, Part, in_blocks, networks, replans, searches, steps
 from torchdyn_plan.evaluation.run import one_thread
 from torchdyn_plan.evaluation.timing import figures, sample
-from torchdyn_plan.nets import ETANetwork, Forecaster
-from torchdyn_plan.nets.eta import Arrival
-from torchdyn_plan.planners import DynamicPlanner, ExactSearch, IKPlanner
+from torchdyn_plan.planners import DynamicPlanner, IKPlanner
 
-BATCHES = (1, 64, 1024, 10000)
+BATCHES = (1, 16, 256, 1024, 4096, 16384)
 """Rows that plan at once."""
+BLOCK = 1024
+"""Rows that are worked on at a time on a processor, if there are more."""
 SINGLES = 16
 """Rows of a batch that are compared with the same rows computed one by one."""
 FIRST_PLAN = 13
 """Control step of the first plan."""
-
-Part = Callable[[TensorDictBase], tuple[Tensor, ...]]
-"""Something timed: from what the planner sees of some rows to what is compared."""
+TRAINED, FOLDED = "torchdyn_plan", "torchdyn_plan, folded"
+"""Implementations: the networks as they are trained, and their copies for inference."""
 
 
 def bench(
-    planner: DynamicPlanner | None = None, *, batches: Sequence[int] = BATCHES, seconds: float = 0.4
+    planner: DynamicPlanner | None = None,
+    *,
+    batches: Sequence[int] = BATCHES,
+    seconds: float = 0.4,
+    compiled: bool = True,
 ) -> list[dict[str, Any]]:
-    """A row for each device, batch and part: latency, and the greatest difference from the rows one by one.
+    """A row for each device, batch, part and implementation.
+
+    A row has the latency's median, 95th and 99th percentile, the throughput ``per_second``, and ``max_error``: the
+    greatest difference from the same rows one by one, eager and with the networks as they are trained. A meeting may
+    differ much where two are as good: rounding decides.
 
     Args:
         planner: an `IKPlanner` made to meet a moving target by networks; the one that ships by default.
         batches: rows that plan at once.
         seconds: time spent on each figure.
+        compiled: also measure re-plans and networks compiled; each takes up to three compilations of a minute or less.
     """
     from tqdm import tqdm
 
     planner = planner or DynamicPlanner.from_pretrained("trapper-ik")
     devices = ["cpu", *(["cuda"] if torch.cuda.is_available() else [])]
     rows = []
-    with one_thread(), torch.no_grad():
+    with one_thread(), torch.no_grad(), tqdm(desc="re-plan", unit="figure", leave=False) as bar:
         for device in devices:
-            parts = _parts(planner.to(device))
-            for batch in tqdm(batches, desc=f"replan on {device}", unit="batch", leave=False):
+            forms = _forms(planner.to(device), device, compiled=compiled)
+            for batch in batches:
                 seen = observations(batch).to(device)
                 seen.set(keys.PLAN, planner(seen.copy())[keys.PLAN])
-                rows += [_row(what, part, seen, device, seconds) for what, part in parts.items()]
+                for form in forms:
+                    bar.set_postfix_str(f"{device}, batch {batch}, {form[0]['what']}")
+                    rows.append(_row(form, seen, device, seconds))
+                    bar.update()
     planner.to("cpu")
     return rows
 
 
-def _row(what: str, part: Part, seen: TensorDictBase, device: str, seconds: float) -> dict[str, Any]:
-    batch = len(seen)
-    durations = sample(partial(part, seen), device=device, seconds=seconds)
-    about = {
-        "what": what, "implementation": "torchdyn_plan", "batch": batch, "threads": torch.get_num_threads(),
-        "compiled": False, "device": device,
-    }  # fmt: skip
-    return about | figures(durations, batch) | {"max_error": _error(part, seen)}
+Form = tuple[dict[str, Any], Part, Part, Inputs]
+"""What a row is about, what is timed, what it is compared with, and what both read."""
 
 
-def _error(part: Part, seen: TensorDictBase) -> float:
-    """Greatest difference between the first rows of a batch and the same rows one by one."""
-    singles = [part(seen[row : row + 1]) for row in range(min(SINGLES, len(seen)))]
+def _forms(planner: DynamicPlanner, device: str, *, compiled: bool) -> list[Form]:
+    """Everything that is timed on ``device``."""
+    plain, folded = ({**networks(one), **replans(one)} for one in (planner, planner.folded()))
+    forms: list[Form] = []
+
+    def add(parts: dict[str, tuple[Part, Inputs]], implementation: str, change: Callable[[Part], Part] | None) -> None:
+        for what, (part, inputs) in parts.items():
+            about = {"what": what, "implementation": implementation, "compiled": change is not None}
+            reference = plain.get(what, (part, inputs))[0]
+            forms.append((about, part if change is None else change(part), reference, inputs))
+
+    add(plain | searches() | steps(planner), TRAINED, None)
+    add(folded, FOLDED, None)
+    if compiled:
+        mode = "reduce-overhead" if device == "cuda" else "default"
+        add(folded, FOLDED, partial(torch.compile, fullgraph=True, mode=mode))
+    return forms
+
+
+def _row(form: Form, seen: TensorDictBase, device: str, seconds: float) -> dict[str, Any]:
+    about, part, reference, inputs = form
+    batch, read = len(seen), inputs(seen)
+    timed = partial(in_blocks, part, BLOCK) if device == "cpu" else part
+    found = figures(sample(lambda: timed(*read), device=device, seconds=seconds), batch)
+    place = {"batch": batch, "threads": torch.get_num_threads(), "device": device}
+    error = _error(lambda one: timed(*inputs(one)), lambda one: reference(*inputs(one)), seen)
+    return about | place | found | {"per_second": round(1e6 / found["per_item_us"]), "max_error": error}
+
+
+def _error(
+    part: Callable[[TensorDictBase], Sequence[Tensor]],
+    reference: Callable[[TensorDictBase], Sequence[Tensor]],
+    seen: TensorDictBase,
+) -> float:
+    """Greatest difference between the first rows of a batch and what ``reference`` makes of them one by one."""
+    singles = [reference(seen[row : row + 1]) for row in range(min(SINGLES, len(seen)))]
     pairs = zip(part(seen), map(torch.cat, zip(*singles, strict=True)), strict=True)
     return max(float((whole[: len(single)].double() - single.double()).abs().max()) for whole, single in pairs)
 
@@ -93,45 +132,3 @@ def observations(batch: int) -> TensorDict:
         keys.STEP_COUNT: torch.full((batch,), FIRST_PLAN),
     }  # fmt: skip
     return TensorDict(entries, batch_size=[batch])
-
-
-def _parts(planner: DynamicPlanner) -> dict[str, Part]:
-    """What is timed, by name."""
-    static, forecaster, eta = planner.static, planner.forecaster, planner.eta
-    assert isinstance(static, IKPlanner)
-    assert isinstance(forecaster, Forecaster)
-    assert isinstance(eta, ETANetwork)
-
-    def replan(seen: TensorDictBase) -> tuple[Tensor, ...]:
-        return planner.plan(seen[keys.ROBOT_STATE], seen[keys.TARGET_POS], seen[keys.TARGET_HISTORY])[:2]
-
-    def replan_exactly(seen: TensorDictBase) -> tuple[Tensor, ...]:
-        arrival = partial(eta.arrival, seen[keys.ROBOT_STATE].unsqueeze(-2))
-        return ExactSearch()(forecaster(seen[keys.TARGET_HISTORY]), seen[keys.TARGET_POS], arrival)[:2]
-
-    def arrivals(seen: TensorDictBase, goals: int) -> tuple[Tensor, ...]:
-        state, goal = seen[keys.ROBOT_STATE].unsqueeze(1), seen[keys.TARGET_POS].unsqueeze(1)
-        return (eta(state, goal.expand(-1, goals, 3)),)
-
-    def search(seen: TensorDictBase) -> tuple[Tensor, ...]:
-        here = seen[keys.TARGET_POS]
-        newest = seen[keys.TARGET_HISTORY].diff(dim=1)[:, -1:]
-        forecast = here.unsqueeze(1) + newest * forecaster.steps_ahead.unsqueeze(-1)
-        return planner.search(forecast, here, _constant_arrival)[:2]
-
-    return {
-        "re-plan": replan,
-        "re-plan, exact search": replan_exactly,
-        "forecaster": lambda seen: (forecaster(seen[keys.TARGET_HISTORY]),),
-        "ETA, 1 goal": partial(arrivals, goals=1),
-        "ETA, 4 goals": partial(arrivals, goals=4),
-        "search alone": search,
-        "IK path of 5 steps": lambda seen: (static.path(seen[keys.JOINT_POS], seen[keys.GOAL]),),
-        "planner step that plans": lambda seen: (planner(seen.exclude(keys.PLAN))[keys.ACTION],),
-        "planner step between plans": lambda seen: (planner(seen.copy())[keys.ACTION],),
-    }
-
-
-def _constant_arrival(goal: Tensor, **_: Any) -> Arrival:
-    """Every goal in 50 control steps, at no cost."""
-    return Arrival(goal.new_full(goal.shape[:-1], 50.0), goal.new_zeros(goal.shape[:-1], dtype=torch.bool))

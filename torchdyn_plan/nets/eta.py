@@ -1,7 +1,9 @@
 """When the robot can be somewhere: a classifier of arrival times, as a static planner would drive it there."""
 
+from __future__ import annotations
+
 from dataclasses import dataclass
-from typing import Any, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import torch
 from torch import Tensor, nn
@@ -10,6 +12,9 @@ from torchdyn_plan.checks import check_choice, check_finite, check_number, check
 from torchdyn_plan.errors import InputError
 from torchdyn_plan.nets.pretrained import Pretrained
 
+if TYPE_CHECKING:
+    from torchdyn_plan.nets.folded_eta import FoldedETA
+
 
 class Arrival(NamedTuple):
     """When, and whether, the robot arrives."""
@@ -17,7 +22,7 @@ class Arrival(NamedTuple):
     steps: Tensor
     """``(*B,)`` control steps from now, in the network's dtype; where ``never`` is True, if it arrived after all."""
     never: Tensor
-    """``(*B,)`` bool: the goal is not reached within the bins."""
+    """``(*B,)`` bool: the goal is not reached within the bins; in the reading ``soft``, the probability of that."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -112,10 +117,16 @@ class ETANetwork(Pretrained, nn.Module):
         Args:
             robot_state: as in `forward`.
             goal: as in `forward`.
-            reading: ``mode``, the paper's, or ``expectation``, which is finer than a bin.
+            reading: ``mode``, the paper's; ``expectation``, which is finer than a bin; or ``soft``, for gradients.
         """
         check_choice("reading", reading, READINGS)
         return READINGS[reading](self(robot_state, goal), bin_width=self.config.bin_width)
+
+    def folded(self) -> FoldedETA:
+        """A copy for inference, in fewer operations; what becomes of the weights later does not reach it."""
+        from torchdyn_plan.nets.folded_eta import FoldedETA
+
+        return FoldedETA(self)
 
     def _goal_features(self, robot_state: Tensor, goal: Tensor) -> Tensor:
         """Goal, its offset from the tool, level and full distance: ``(*B, 8)``."""
@@ -149,25 +160,40 @@ def decode_mode(logits: Tensor, *, bin_width: int = 5) -> Arrival:
     return Arrival(steps.to(logits.dtype), never)
 
 
-def decode_expectation(logits: Tensor, *, bin_width: int = 5) -> Arrival:
+def decode_expectation(logits: Tensor, *, bin_width: int = 5, moments: Tensor | None = None) -> Arrival:
     """Mean arrival time given that the robot arrives: differentiable, and finer than a bin.
 
     Args:
         logits: ``(*B, bins + 1)``, the last for *never arrives*.
         bin_width: control steps in a bin.
+        moments: `arrival_moments` of the same bins, for whoever has them at hand.
 
     Returns:
         `Arrival` of ``(*B,)``; ``never`` where *never* is likelier than all bins together.
     """
-    bins = logits.shape[-1] - 1
-    middle = bin_width * torch.arange(bins, device=logits.device, dtype=logits.dtype) + (bin_width - 1) / 2
-    # One product, whose last row leaves *never* out: the probability of arriving, and the sum of times.
-    moments = torch.nn.functional.pad(torch.stack([torch.ones_like(middle), middle], dim=-1), (0, 0, 0, 1))
+    if moments is None:
+        moments = arrival_moments(logits, bin_width)
     arrives, weighted = (logits.softmax(dim=-1) @ moments).unbind(-1)
     return Arrival(weighted / arrives.clamp_min(1e-12), arrives < 0.5)
 
 
-READINGS = {"mode": decode_mode, "expectation": decode_expectation}
+def arrival_moments(logits: Tensor, bin_width: int) -> Tensor:
+    """Matrix ``(bins + 1, 2)`` from probabilities (*B, bins + 1) to that of arriving and the sum of times.
+
+    Its last row leaves *never* out.
+    """
+    bins = logits.shape[-1] - 1
+    middle = bin_width * torch.arange(bins, device=logits.device, dtype=logits.dtype) + (bin_width - 1) / 2
+    return torch.nn.functional.pad(torch.stack([torch.ones_like(middle), middle], dim=-1), (0, 0, 0, 1))
+
+
+def decode_soft(logits: Tensor, *, bin_width: int = 5) -> Arrival:
+    """As `decode_expectation`, but ``never`` is a probability: all of it is differentiable."""
+    arrival = decode_expectation(logits, bin_width=bin_width)
+    return Arrival(arrival.steps, logits.softmax(dim=-1)[..., -1])
+
+
+READINGS = {"mode": decode_mode, "expectation": decode_expectation, "soft": decode_soft}
 """How a distribution over bins becomes one arrival time."""
 
 

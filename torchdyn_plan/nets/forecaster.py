@@ -1,7 +1,9 @@
 """Where the target will be: a convolutional network that emits the whole horizon at once, without recurrence."""
 
+from __future__ import annotations
+
 from dataclasses import dataclass
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import torch
 from torch import Tensor, nn
@@ -11,6 +13,9 @@ from torchdyn_plan.errors import InputError
 from torchdyn_plan.nets.cushions import fold
 from torchdyn_plan.nets.pretrained import Pretrained
 from torchdyn_plan.nets.symmetry import octant, square_symmetries
+
+if TYPE_CHECKING:
+    from torchdyn_plan.nets.folded import FoldedForecaster
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -121,6 +126,12 @@ class Forecaster(Pretrained, nn.Module):
         """Same as `forward` before cushions mirror the line: what training compares, ``(*B, F, 3)`` [m, world]."""
         return self._forecast(target_history, folded=False)
 
+    def folded(self) -> FoldedForecaster:
+        """A copy for inference, in fewer operations; what becomes of the weights later does not reach it."""
+        from torchdyn_plan.nets.folded import FoldedForecaster
+
+        return FoldedForecaster(self)
+
     def _forecast(self, target_history: Tensor, *, folded: bool) -> Tensor:
         if not torch.compiler.is_compiling():
             self._check(target_history)
@@ -145,7 +156,7 @@ class Forecaster(Pretrained, nn.Module):
         newest = step[:, -1]
         features = self._step_features(step)
         for layer in (self.embed, *self.convolve):
-            features = _convolve(features, layer).relu_()
+            features = convolve(features, layer).relu_()
         joined = torch.cat([features.flatten(1), self._present_features(now, newest)], dim=-1)
         hidden = self.hidden(self.join(joined).relu_()).relu_()
         departure = self.head(self.mix(hidden)).view(-1, 3, self.config.horizon)
@@ -175,7 +186,7 @@ class Forecaster(Pretrained, nn.Module):
         check_finite("target_history", target_history)
 
 
-def _convolve(features: Tensor, layer: Any) -> Tensor:
+def convolve(features: Tensor, layer: Any) -> Tensor:
     """What ``layer`` makes of ``features`` (R, L, C), as a matrix product: faster for few rows and channels.
 
     Steps are repeated at the old end, where they are too few for the last window to end with the newest one.

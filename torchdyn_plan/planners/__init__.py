@@ -12,6 +12,7 @@ from torchdyn_plan.planners.policy import PolicyPlanner
 from torchdyn_plan.planners.protocol import StaticPlanner
 from torchdyn_plan.planners.schedule import EventSchedule, ReplanSchedule, Schedule
 from torchdyn_plan.planners.search import CornerSearch, SearchResult, search_corners
+from torchdyn_plan.planners.soft import SoftCornerSearch, SoftExactSearch
 from torchdyn_plan.planners.status import PlanStatus
 
 __all__ = [
@@ -31,6 +32,8 @@ __all__ = [
     "ReplanSchedule",
     "Schedule",
     "SearchResult",
+    "SoftCornerSearch",
+    "SoftExactSearch",
     "StaticPlanner",
     "TargetPursuit",
     "WaitAtEnd",

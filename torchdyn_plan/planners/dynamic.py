@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import copy
 import math
 from collections.abc import Callable
 from functools import partial
+from typing import Self
 
 import torch
 from tensordict import TensorDictBase
@@ -14,6 +16,7 @@ from torch import Tensor
 from torchdyn_plan import keys
 from torchdyn_plan.checks import check_choice, check_number, check_same_device, check_trailing_shape
 from torchdyn_plan.nets.eta import Arrival
+from torchdyn_plan.planners.arrivals import arrivals_from
 from torchdyn_plan.planners.ik import IKPlanner
 from torchdyn_plan.planners.latency import AtOnce, Delayed, Delivery, Job, Values, arrival_after, skip_steps
 from torchdyn_plan.planners.memory import MEMORY_KEYS, USABLE, carry_on, carry_use, recall, remember
@@ -153,7 +156,7 @@ class DynamicPlanner(TensorDictModuleBase):
 
     def _arrival(self, robot_state: Tensor) -> Callable[..., Arrival]:
         """Maps goals (*B, K, 3) to arrivals from when the plan takes effect."""
-        return arrival_after(partial(self.eta.arrival, robot_state.unsqueeze(-2)), self.latency)
+        return arrival_after(arrivals_from(self.eta, robot_state), self.latency)
 
     def _outlook(self, forecast: Tensor, target_pos: Tensor) -> tuple[Tensor, ...]:
         """What is kept of a forecast, ``(R, T, 3)``, and its age, 0; nothing where nobody looks at it."""
@@ -221,6 +224,18 @@ class DynamicPlanner(TensorDictModuleBase):
         arrival = self.eta.arrival(robot_state.unsqueeze(-2), goal.unsqueeze(-2), reading="expectation")
         needed = arrival.steps.masked_fill(arrival.never, torch.inf).squeeze(-1)
         return (needed - planned_steps,)
+
+    def folded(self) -> Self:
+        """A planner for inference: the same parts, but copies of the networks in fewer operations, where there are any.
+
+        What becomes of the weights later does not reach it: fold again.
+        """
+        other = copy.copy(self)
+        other._modules = dict(self._modules)
+        for name in ("forecaster", "eta"):
+            part = getattr(self, name)
+            setattr(other, name, part.folded() if hasattr(part, "folded") else part)
+        return other
 
     def _read(self, tensordict: TensorDictBase) -> list[Tensor]:
         """Tool and target (*B, 3) [m, world], robot state (*B, S), step count (*B,), and what the forecaster reads."""

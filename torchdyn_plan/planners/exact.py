@@ -4,7 +4,8 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
+from functools import partial
+from typing import TYPE_CHECKING, NamedTuple
 
 import torch
 from torch import Tensor
@@ -14,6 +15,21 @@ from torchdyn_plan.planners.search import SearchResult
 
 if TYPE_CHECKING:
     from torchdyn_plan.nets.eta import Arrival
+
+
+class Candidates(NamedTuple):
+    """Places and times at which the target could be met, K of them."""
+
+    goals: Tensor
+    """``(*B, K, 3)`` [m, world]."""
+    comes: Tensor
+    """``(*B, K)`` or ``(K,)`` int64: control steps until the target comes within the footprint."""
+    score: Tensor
+    """``(*B, K)`` or ``(K,)``: what the meeting is worth to a robot that is in time."""
+    stay: Tensor | None
+    """``(*B, K)`` int64: control steps that the target stays; None where stays are not judged."""
+    on_table: Tensor
+    """``(*B, K)`` bool: the target is not in a pocket."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -48,9 +64,15 @@ class ExactSearch:
     """Score of keeping the meeting planned before."""
     arrived: float = 0.0
     """A goal within this distance of the tool, sideways, is reached now [m]."""
+    coarse: int = 1
+    """Ask for every so many candidates first, then for those around the likely best; 1 asks for all at once.
+
+    Made for the first crossing. It costs meetings where a robot waits: beneath the tool arrival times are not smooth.
+    """
 
     def __post_init__(self) -> None:
         check_number("stride", self.stride, minimum=1, integer=True)
+        check_number("coarse", self.coarse, minimum=1, integer=True)
         check_number("longest_stay", self.longest_stay, minimum=1, integer=True)
         for name in ("lead", "margin", "footprint", "patience", "loyalty", "arrived"):
             check_number(name, getattr(self, name), minimum=0.0)
@@ -83,30 +105,42 @@ class ExactSearch:
         Raises:
             InputError: an argument has another shape, or their batches differ.
         """
-        horizon = _checked_horizon(forecast, target_pos, tool_pos, planned_steps)
-        path = torch.cat([target_pos.unsqueeze(-2), forecast], dim=-2)
-        first = min(2, horizon)
-        steps = torch.arange(first, horizon + 1, self.stride, device=path.device)
-        places = path[..., first :: self.stride, :]
-        goals = self.goals(places)
-        before, stay = self.stays(path, goals, first)
-        comes = steps - before
-        score = stay - self.patience * steps
-        early = comes - self.lead - self._needed(goals, eta, tool_pos)
-        slack = early - self.margin
+        horizon = checked_horizon(forecast, target_pos, tool_pos, planned_steps)
+        goals, comes, score, stay, on_table = self.candidates(forecast, target_pos, horizon)
+        kept = None
         if planned_steps is not None:
             # Nearer in time than any other candidate, or as near: the same meeting.
             kept = (comes - planned_steps.unsqueeze(-1)).abs() <= max(self.stride // 2, 1)
-            score, slack = score + self.loyalty * kept, torch.where(kept, early, slack)
-        best, reachable = _best(score, slack, stay=stay, on_table=places[..., 2] > 0.0)
+            score = score + self.loyalty * kept
+
+        def choose(needed: Tensor) -> tuple[Tensor, Tensor]:
+            early = comes - self.lead - needed
+            slack = early - self.margin
+            slack = slack if kept is None else torch.where(kept, early, slack)
+            return _best(score, slack, stay=stay, on_table=on_table)
+
+        ask = partial(self._needed, eta=eta, tool_pos=tool_pos)
+        best, reachable = choose(ask(goals)) if self.coarse == 1 else choose_nearby(choose, ask, goals, self.coarse)
         return SearchResult(
             goal=goals.gather(-2, best.unsqueeze(-1).expand(*best.shape, 3)).squeeze(-2),
-            arrival_steps=comes.gather(-1, best).squeeze(-1),
+            arrival_steps=comes.expand(goals.shape[:-1]).gather(-1, best).squeeze(-1),
             clamped=torch.zeros_like(reachable),
             reachable=reachable,
         )
 
-    def _needed(self, goals: Tensor, eta: Callable[..., Arrival], tool_pos: Tensor | None) -> Tensor:
+    def candidates(self, forecast: Tensor, target_pos: Tensor, horizon: int) -> Candidates:
+        """Where and when the target could be met, whatever the robot needs; arguments as for a call."""
+        first = min(2, horizon)
+        steps = torch.arange(first, horizon + 1, self.stride, device=forecast.device)
+        places = forecast[..., first - 1 :: self.stride, :]
+        goals, on_table = self.goals(places), places[..., 2] > 0.0
+        if self.footprint == 0.0:
+            return Candidates(goals, steps, 1 - self.patience * steps, None, on_table)
+        path = torch.cat([target_pos.unsqueeze(-2), forecast], dim=-2)
+        before, stay = self.stays(path, goals, first)
+        return Candidates(goals, steps - before, stay - self.patience * steps, stay, on_table)
+
+    def _needed(self, goals: Tensor, *, eta: Callable[..., Arrival], tool_pos: Tensor | None) -> Tensor:
         """Control steps (*B, K) to each goal (*B, K, 3): infinitely many where the robot never arrives."""
         arrival = eta(goals, reading="expectation")
         needed = arrival.steps.masked_fill(arrival.never, torch.inf)
@@ -136,9 +170,6 @@ class ExactSearch:
             Both ``(*B, K)`` int64, in control steps; the stay is 0 where the target never comes within the footprint.
             Neither the past counts nor what comes after the forecast.
         """
-        if self.footprint == 0.0:
-            one = torch.ones(goals.shape[:-1], dtype=torch.int64, device=goals.device)
-            return torch.zeros_like(one), one
         longest = self.longest_stay
         level = torch.where(path[..., 2:] > 0.0, path[..., :2], torch.inf)
         level = torch.nn.functional.pad(level, (0, 0, longest, longest), value=torch.inf)
@@ -151,8 +182,8 @@ class ExactSearch:
         return (before - 1).clamp_min(0), (before + after - 1).clamp(0, longest)
 
 
-def _checked_horizon(
-    forecast: Tensor, target_pos: Tensor, tool_pos: Tensor | None, planned_steps: Tensor | None
+def checked_horizon(
+    forecast: Tensor, target_pos: Tensor, tool_pos: Tensor | None = None, planned_steps: Tensor | None = None
 ) -> int:
     """F; raises `InputError` where a shape is wrong."""
     check_trailing_shape("target_pos", target_pos, 3)
@@ -165,11 +196,41 @@ def _checked_horizon(
     return horizon
 
 
-def _best(score: Tensor, slack: Tensor, *, stay: Tensor, on_table: Tensor) -> tuple[Tensor, Tensor]:
+def choose_nearby(
+    choose: Callable[[Tensor], tuple[Tensor, Tensor]], ask: Callable[[Tensor], Tensor], goals: Tensor, coarse: int
+) -> tuple[Tensor, Tensor]:
+    """What ``choose`` returns when it knows the steps needed to every ``coarse``-th goal, and to those near its choice.
+
+    Args:
+        choose: makes its choice from the steps needed to each goal ``(*B, K)``; returns its index ``(*B, 1)`` first.
+        ask: maps goals ``(*B, k, 3)`` to the steps needed ``(*B, k)``; called twice.
+        goals: ``(*B, K, 3)``, along a path: from one to the next the steps needed change little.
+        coarse: first every so many goals are asked for, then as many and one around the best guess.
+    """
+    count = goals.shape[-2]
+    needed = ask(goals[..., ::coarse, :])
+    # Between them the steps needed are interpolated: a product with a triangle for each goal that is known.
+    place = (torch.arange(count, device=goals.device) / coarse).clamp(max=needed.shape[-1] - 1)
+    nodes = torch.arange(needed.shape[-1], device=goals.device).unsqueeze(-1)
+    shares = (1.0 - (place - nodes).abs()).clamp_min(0.0).to(needed.dtype)
+    guess, _ = choose(needed.clamp(max=1e4) @ shares)
+    # Goals before the guess may do as well, and were not asked for; after it, the next one asked for is not far.
+    width = min(coarse + 1, count)
+    window = (guess - coarse + 1).clamp(0, count - width) + torch.arange(width, device=goals.device)
+    known = torch.full(goals.shape[:-1], torch.inf, dtype=needed.dtype, device=goals.device)
+    known[..., ::coarse] = needed
+    nearby = goals.gather(-2, window.unsqueeze(-1).expand(*window.shape, 3))
+    return choose(known.scatter(-1, window, ask(nearby)))
+
+
+def _best(score: Tensor, slack: Tensor, *, stay: Tensor | None, on_table: Tensor) -> tuple[Tensor, Tensor]:
     """Index (*B, 1) of the candidate in time with the highest score, and whether any is in time (*B,); all (*B, K)."""
-    in_time = (slack >= 0.0) & (stay > 0) & on_table
-    nothing = ~in_time.any(dim=-1, keepdim=True)
+    in_time = (slack >= 0.0) & on_table
     # Worse and worse: late, out of the box's reach, never reached by the robot, below the table.
-    late = slack.clamp(min=-1e6) - 1e4 * (stay == 0) - 1e7 * ~on_table
-    score = torch.where(nothing, late, score.masked_fill(~in_time, -torch.inf))
-    return score.argmax(dim=-1, keepdim=True), ~nothing.squeeze(-1)
+    late = slack.clamp(min=-1e6)
+    if stay is not None:
+        in_time, late = in_time & (stay > 0), late - 1e4 * (stay == 0)
+    late = late - 1e7 * ~on_table
+    some = in_time.any(dim=-1, keepdim=True)
+    score = torch.where(some, torch.where(in_time, score, -torch.inf), late)
+    return score.argmax(dim=-1, keepdim=True), some.squeeze(-1)

@@ -70,14 +70,15 @@ def search_corners(forecast: Tensor, target_pos: Tensor, eta: Callable[[Tensor],
     check_trailing_shape("target_pos", target_pos, 3)
     horizon = forecast.shape[-2] if forecast.ndim > 1 else 1
     check_trailing_shape("forecast", forecast, *target_pos.shape[:-1], horizon, 3)
-    path = torch.cat([target_pos.unsqueeze(-2), forecast], dim=-2)
+    now = target_pos.unsqueeze(-2)
+    path = torch.cat([now, forecast], dim=-2)
 
-    here = eta(path[..., :1, :])
+    here = eta(now)
     steps, beyond_here = _on_path(here.steps, horizon)
-    away = _at(path, steps) - path[..., :1, :]
+    away = _at(path, steps) - now
     half_edge = torch.linalg.vector_norm(away, dim=-1, keepdim=True)
 
-    corners = torch.addcmul(path[..., :1, :], half_edge, path.new_tensor(CORNERS))
+    corners = torch.addcmul(now, half_edge, path.new_tensor(CORNERS))
     arrival = eta(corners)
     steps, beyond = _on_path(arrival.steps, horizon)
     met = _at(path, steps)
