@@ -52,15 +52,16 @@ def train(arguments: TrainArguments) -> None:
     from torchdyn_plan.checks import check_writable_folder
 
     check_writable_folder(arguments.out)
-
     if arguments.what == "policy":
         from torchdyn_plan.training.policy import train_trapper
 
         train_trapper(arguments)
         return
-    from torchdyn_plan.training import fit
+    from torchdyn_plan.training import fit, spread
 
-    fits: dict[str, Callable[..., object]] = {"forecaster": fit.fit_forecaster, "eta": fit.fit_eta}
+    fits: dict[str, Callable[..., object]] = {
+        "forecaster": fit.fit_forecaster, "eta": fit.fit_eta, "spread": spread.fit_spread,
+    }  # fmt: skip
     fits[arguments.what](arguments.data, arguments.out, **arguments.settings())
 
 

@@ -211,8 +211,9 @@ class CollectArguments:
 class TrainArguments:
     """Train a network, on collected data or by trial; a killed run continues where its folder stands."""
 
-    what: Literal["forecaster", "eta", "policy"]
-    """Which network: forecaster (paths of the ball), eta (arrival times of the arm) or policy (by DDPG and HER)."""
+    what: Literal["forecaster", "eta", "spread", "policy"]
+    """Which network: forecaster (paths of the ball), eta (arrival times of the arm), spread (how far the forecaster
+    that ships is off, on paths of the ball) or policy (by DDPG and HER)."""
     data: Path = Path("runs/data")
     """Folder of the collected shards; a policy needs none."""
     out: Path = Path("runs/training")

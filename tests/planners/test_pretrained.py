@@ -4,8 +4,16 @@ import torch
 from tests.planners.toy import assert_same
 from torchdyn_plan.envs import TrapperEnv
 from torchdyn_plan.errors import InputError, WeightsError
-from torchdyn_plan.nets import Actor, ETANetwork, Forecaster, pretrained
-from torchdyn_plan.planners import DynamicPlanner, IKPlanner, OracleTrajectory, PolicyPlanner
+from torchdyn_plan.nets import Actor, ETANetwork, Forecaster, SpreadNetwork, pretrained
+from torchdyn_plan.planners import (
+    Adaptation,
+    DynamicPlanner,
+    IKPlanner,
+    MeetingPlanner,
+    OracleTrajectory,
+    PolicyPlanner,
+)
+from torchdyn_plan.planners.meeting import CAUTIOUS, WAITING
 
 
 @pytest.fixture
@@ -88,3 +96,18 @@ def test_missing_weights_and_names_are_told(shipped, kind):
     file.unlink()
     with pytest.raises(WeightsError, match=r"no weights 'trapper-ik' for ETANetwork.*names that ship \(none\)"):
         kind.from_pretrained("trapper-ik")
+
+
+def test_a_cautious_planner_by_name_gets_the_spread_and_another_needs_none(shipped, due):
+    planner = MeetingPlanner.from_pretrained("trapper-ik", chunk=4)
+    assert (planner.search, planner.spread, planner.adaptation) == (WAITING, None, None)
+    with pytest.raises(WeightsError, match="no weights 'trapper' for SpreadNetwork"):
+        MeetingPlanner.from_pretrained("trapper-ik", search=CAUTIOUS)
+    SpreadNetwork(features=8).save_pretrained(shipped[0] / "spread-trapper.safetensors")
+    planner = MeetingPlanner.from_pretrained("trapper-ik", search=CAUTIOUS, adaptation=Adaptation(), chunk=4)
+    assert isinstance(planner.spread, SpreadNetwork)
+    assert (planner.search, planner.chunk, planner.static.chunk) == (CAUTIOUS, 4, 4)
+    with torch.no_grad():
+        td = planner(due.clone())
+    assert bool(td["goal"].isfinite().all())
+    assert set(planner.out_keys) >= {("plan", "drags"), "goal", "action"}

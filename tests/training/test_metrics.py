@@ -2,7 +2,15 @@ import pytest
 import torch
 
 from torchdyn_plan.nets.eta import arrival_classes
-from torchdyn_plan.training.metrics import arrival_errors, arrival_groups, forecast_errors, pocket_accuracy
+from torchdyn_plan.nets.spread import Spread
+from torchdyn_plan.training.metrics import (
+    arrival_errors,
+    arrival_groups,
+    coverage,
+    forecast_errors,
+    pocket_accuracy,
+    swallowed_odds,
+)
 from torchdyn_plan.training.windows import Windows
 
 
@@ -98,3 +106,29 @@ def test_arrival_groups_by_hand():
         "at rest": [True, False, True],
         "in motion": [False, True, False],
     }
+
+
+def test_coverage_by_hand():
+    windows = windows_of()
+    spread = Spread(torch.full((5, 300, 2), 0.01), torch.ones(5, 300, 2), torch.zeros(5, 300))
+    # Intervals of 50, 80, 90 and 95 %: 0.01, 0.04, 0.09 and 0.19 m.
+    off = torch.tensor([0.05, 0.1, 0.0, 0.0, 0.0]).view(5, 1, 1) * torch.tensor([1.0, -0.09, 0.0])
+    rows = by(coverage(windows.future + off, spread, windows), "windows", "ahead")
+    full = rows["full", 100]
+    assert full["count"] == 2
+    assert [full[f"within_{share}"] for share in (50, 80, 90, 95)] == [0.5, 0.5, 0.75, 1.0]
+    assert full["half_width_90"] == pytest.approx(0.09)
+    assert full["near"] == 0.5
+    assert full["near_told"] == pytest.approx((55 / 65) ** 2)
+    assert rows["still", 25]["within_50"] == 1.0
+    assert rows["pocketed", 100]["within_50"] is None
+
+
+def test_odds_of_being_swallowed_by_hand():
+    gone = torch.tensor([0.1, 0.1, 0.1, 0.6, 0.9]).unsqueeze(-1).expand(5, 300)
+    rows = by(swallowed_odds(Spread(torch.ones(5, 300, 2), torch.ones(5, 300, 2), gone), windows_of()), "ahead")
+    assert rows[25,] == pytest.approx({"ahead": 25, "count": 4, "told": 0.225, "share": 0.0, "brier": 0.0975,
+                                       "brier_share": 0.0})  # fmt: skip
+    assert rows[100,]["share"] == 0.25
+    assert rows[100,]["brier"] == pytest.approx((0.03 + 0.16) / 4)
+    assert rows[100,]["brier_share"] == pytest.approx(0.1875)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, NamedTuple
 
@@ -23,6 +24,21 @@ class Arrival(NamedTuple):
     """``(*B,)`` control steps from now, in the network's dtype; where ``never`` is True, if it arrived after all."""
     never: Tensor
     """``(*B,)`` bool: the goal is not reached within the bins; in the reading ``soft``, the probability of that."""
+
+
+class ArrivalOdds(Arrival):
+    """An `Arrival` with the whole distribution."""
+
+    bins: Tensor
+    """``(*B, bins)`` probability of arriving within each bin; what is missing to 1 is that of *never*."""
+    bin_width: int
+    """Control steps in a bin."""
+
+    def by(self, time: Tensor) -> Tensor:
+        """P(the robot is there ``time`` (*B,) control steps from now): ``(*B,)``, linear within a bin."""
+        number = torch.arange(self.bins.shape[-1], device=self.bins.device)
+        passed = (time.unsqueeze(-1) / self.bin_width - number).clamp(0.0, 1.0)
+        return (self.bins * passed).sum(-1).clamp(0.0, 1.0)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -117,7 +133,8 @@ class ETANetwork(Pretrained, nn.Module):
         Args:
             robot_state: as in `forward`.
             goal: as in `forward`.
-            reading: ``mode``, the paper's; ``expectation``, which is finer than a bin; or ``soft``, for gradients.
+            reading: ``mode``, the paper's; ``expectation``, which is finer than a bin; ``odds``, which is the same with
+                the whole distribution; or ``soft``, for gradients.
         """
         check_choice("reading", reading, READINGS)
         return READINGS[reading](self(robot_state, goal), bin_width=self.config.bin_width)
@@ -193,7 +210,16 @@ def decode_soft(logits: Tensor, *, bin_width: int = 5) -> Arrival:
     return Arrival(arrival.steps, logits.softmax(dim=-1)[..., -1])
 
 
-READINGS = {"mode": decode_mode, "expectation": decode_expectation, "soft": decode_soft}
+def decode_odds(logits: Tensor, *, bin_width: int = 5) -> ArrivalOdds:
+    """`decode_expectation` of the same logits ``(*B, bins + 1)``, and the probability of each bin."""
+    odds = ArrivalOdds(*decode_expectation(logits, bin_width=bin_width))
+    odds.bins, odds.bin_width = logits.softmax(dim=-1)[..., :-1], bin_width
+    return odds
+
+
+READINGS: dict[str, Callable[..., Arrival]] = {
+    "mode": decode_mode, "expectation": decode_expectation, "soft": decode_soft, "odds": decode_odds,
+}  # fmt: skip
 """How a distribution over bins becomes one arrival time."""
 
 

@@ -120,11 +120,22 @@ class Forecaster(Pretrained, nn.Module):
         Raises:
             InputError: the history has another shape, another device than the network, or holds a NaN.
         """
-        return self._forecast(target_history, folded=self.config.half_extent is not None)
+        return self._forecast(target_history, folded=self.config.half_extent is not None)[0]
+
+    def describe(self, target_history: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        """The same forecast, and what a `torchdyn_plan.nets.SpreadNetwork` judges it by.
+
+        Returns:
+            Positions (*B, F, 3) [m, world], the last hidden layer (*B, hidden), and whether x and y are exchanged
+            in it (*B,): mirrored and turned histories share their features.
+        """
+        forecast, features, swapped = self._forecast(target_history, folded=self.config.half_extent is not None)
+        batch = target_history.shape[:-2]
+        return forecast, features.view(*batch, self.config.hidden), swapped.view(batch)
 
     def unfolded(self, target_history: Tensor) -> Tensor:
         """Same as `forward` before cushions mirror the line: what training compares, ``(*B, F, 3)`` [m, world]."""
-        return self._forecast(target_history, folded=False)
+        return self._forecast(target_history, folded=False)[0]
 
     def folded(self) -> FoldedForecaster:
         """A copy for inference, in fewer operations; what becomes of the weights later does not reach it."""
@@ -132,7 +143,8 @@ class Forecaster(Pretrained, nn.Module):
 
         return FoldedForecaster(self)
 
-    def _forecast(self, target_history: Tensor, *, folded: bool) -> Tensor:
+    def _forecast(self, target_history: Tensor, *, folded: bool) -> tuple[Tensor, Tensor, Tensor]:
+        """Positions (*B, F, 3), hidden features (R, hidden) and whether x and y are exchanged in them (R,)."""
         if not torch.compiler.is_compiling():
             self._check(target_history)
         config = self.config
@@ -142,16 +154,17 @@ class Forecaster(Pretrained, nn.Module):
             # A pinch of position decides for a target that moves along an axis or lies still.
             turn = self.symmetries[octant(torch.add(now - before, now, alpha=1e-6))]
             history = torch.bmm(history, turn)
-        line = self._line(history)
+        line, hidden = self._line(history)
         if folded:
             assert config.half_extent is not None
             line = torch.cat([fold(line[:, :2], config.half_extent), line[:, 2:]], dim=1)
         if turn is not None:
             line = torch.bmm(turn, line)
-        return line.mT.view(*target_history.shape[:-2], config.horizon, 3)
+        swapped = hidden.new_zeros(len(hidden), dtype=torch.bool) if turn is None else turn[:, 0, 0] == 0.0
+        return line.mT.view(*target_history.shape[:-2], config.horizon, 3), hidden, swapped
 
-    def _line(self, history: Tensor) -> Tensor:
-        """Unfolded positions ``(R, 3, F)`` after the turned histories ``(R, H, 3)`` [m]."""
+    def _line(self, history: Tensor) -> tuple[Tensor, Tensor]:
+        """Unfolded positions ``(R, 3, F)`` after the turned histories ``(R, H, 3)`` [m], and the last hidden layer."""
         now, step = history[:, -1], history[:, 1:] - history[:, :-1]
         newest = step[:, -1]
         features = self._step_features(step)
@@ -161,7 +174,7 @@ class Forecaster(Pretrained, nn.Module):
         hidden = self.hidden(self.join(joined).relu_()).relu_()
         departure = self.head(self.mix(hidden)).view(-1, 3, self.config.horizon)
         straight = torch.addcmul(now.unsqueeze(-1), newest.unsqueeze(-1), self._time)
-        return torch.addcmul(straight, departure, self._scale)
+        return torch.addcmul(straight, departure, self._scale), hidden
 
     def _step_features(self, step: Tensor) -> Tensor:
         """Each step, its difference from the newest one, and whether it is no padding, ``(R, H-1, 7)``."""

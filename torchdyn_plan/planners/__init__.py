@@ -1,5 +1,6 @@
 """Planners: for a static goal, for a moving target, and the baselines; each takes and returns a tensordict."""
 
+from torchdyn_plan.planners.adaptation import Adaptation
 from torchdyn_plan.planners.background import Background, measured_latency
 from torchdyn_plan.planners.baselines import OracleTrajectory, TargetPursuit, WaitAtEnd
 from torchdyn_plan.planners.callable import CallablePlanner
@@ -17,6 +18,7 @@ from torchdyn_plan.planners.status import PlanStatus
 
 __all__ = [
     "STATIC_PLANNERS",
+    "Adaptation",
     "Background",
     "CallablePlanner",
     "CornerSearch",

@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import copy
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from functools import partial
-from typing import Self
+from typing import Any, Self
 
 import torch
 from tensordict import TensorDictBase
@@ -57,6 +57,8 @@ class DynamicPlanner(TensorDictModuleBase):
     """Whether it looks at the forecast between plans, whatever the schedule."""
     own_names: tuple[str, ...] = ()
     """What it remembers under ``plan`` beside its plans."""
+    kept_names: tuple[str, ...] = ()
+    """What a plan hands on to the next one in its row."""
 
     def __init__(
         self,
@@ -137,20 +139,30 @@ class DynamicPlanner(TensorDictModuleBase):
             target_pos: ``(R, 3)`` [m, world].
             tool_pos: ``(R, 3)`` [m, world].
             planned_steps: ``(R,)`` control steps to the meeting planned before, from when the plan takes effect.
-            seen: what the forecaster reads.
+            seen: what the plan before handed on, and what the forecaster reads.
 
         Returns:
-            A `SearchResult`'s entries, whether the forecast was of any use ``(R,)``, and the outlook and its age if it
-            is kept.
+            A `SearchResult`'s entries, whether the forecast was of any use ``(R,)``, the outlook and its age if it is
+            kept, and what is handed on.
         """
-        forecast, usable = usable_forecast(self.forecaster(*seen), target_pos)
+        kept, seen = seen[: len(self.kept_names)], seen[len(self.kept_names) :]
+        forecast, hints = self._forecast(*seen)
+        forecast, usable = usable_forecast(forecast, target_pos)
+        forecast, kept = self._adapt(forecast, target_pos, kept)
         forecast, target_pos = skip_steps(forecast, target_pos, self.latency)
-        meeting = self._choose(robot_state, forecast, target_pos, tool_pos=tool_pos, planned_steps=planned_steps)
-        return (*meeting, usable, *self._outlook(forecast, target_pos))
+        hints |= {"tool_pos": tool_pos, "planned_steps": planned_steps}
+        meeting = self._choose(robot_state, forecast, target_pos, **hints)
+        return (*meeting, usable, *self._outlook(forecast, target_pos), *kept)
 
-    def _choose(
-        self, robot_state: Tensor, forecast: Tensor, target_pos: Tensor, **tool_and_plan: Tensor
-    ) -> SearchResult:
+    def _forecast(self, *seen: Tensor) -> tuple[Tensor, dict[str, Any]]:
+        """The forecast, and what else a search may want to know of it."""
+        return self.forecaster(*seen), {}
+
+    def _adapt(self, forecast: Tensor, target_pos: Tensor, kept: Sequence[Tensor]) -> tuple[Tensor, Sequence[Tensor]]:
+        """The forecast in the light of those before it, and what to hand on."""
+        return forecast, kept
+
+    def _choose(self, robot_state: Tensor, forecast: Tensor, target_pos: Tensor, **hints: Any) -> SearchResult:
         """A meeting on the forecast from when the plan takes effect; the paper's search knows nothing of the tool."""
         return self.search(forecast, target_pos, self._arrival(robot_state))
 
@@ -177,7 +189,8 @@ class DynamicPlanner(TensorDictModuleBase):
     @property
     def _value_names(self) -> tuple[str, ...]:
         """What a plan consists of: a meeting, whether its forecast was of use, and an outlook if it is kept."""
-        return (*SearchResult._fields, USABLE, *(OUTLOOK_NAMES if self._with_outlook else ()))
+        outlook = OUTLOOK_NAMES if self._with_outlook else ()
+        return (*SearchResult._fields, USABLE, *outlook, *self.kept_names)
 
     def _replan(
         self, tensordict: TensorDictBase, tool_pos: Tensor, target_pos: Tensor, robot_state: Tensor,
@@ -192,24 +205,31 @@ class DynamicPlanner(TensorDictModuleBase):
         used = (*carry_on(memory, tool_pos, step_count), carry_use(tensordict, step_count))
         if self._with_outlook:
             used += recall_outlook(tensordict, target_pos, step_count, self.outlook_steps)
+        used += self._recall_kept(tensordict, target_pos, step_count)
         values, busy = self.delivery.arrive(kept, dict(zip(self._value_names, used, strict=True)), step_count)
         look = partial(self._look, values, target_pos, robot_state)
         clock, due = self.schedule.tick(None if memory is None else memory.clock, step_count, busy=busy, look=look)
         trouble = input_status(target_pos, seen, self.gone_below)
         able = due & (trouble == 0)
         planned_steps = (values["arrival_steps"] - self.latency).clamp_min(0)
-        inputs = (robot_state, target_pos, tool_pos, planned_steps, *seen)
+        handed_on = [values[name] for name in self.kept_names]
+        inputs = (robot_state, target_pos, tool_pos, planned_steps, *handed_on, *seen)
         job = Job(self.plan_ahead, able, inputs, step_count, self.chunk)
         values, pending = self.delivery.order(job, kept, values)
-        goal, arrival_steps, clamped, reachable, usable, *outlook = values.values()
+        goal, arrival_steps, clamped, reachable, usable = (values[name] for name in (*SearchResult._fields, USABLE))
         failed = due & ~(able & pending.get(f"pending_{USABLE}", usable))
         holds = (due & ~able) | ~usable
         meeting = held(SearchResult(goal, arrival_steps, clamped, reachable), holds, tool_pos)
         clock = try_again(clock, failed, memory, self.schedule, step_count)
         status = plan_status(trouble, ~usable, clock, meeting.reachable)
-        others = {USABLE: usable, **dict(zip(OUTLOOK_NAMES, outlook)), **pending}  # noqa: B905
+        others = {name: values[name] for name in self._value_names[len(SearchResult._fields) :]} | pending
         remember(tensordict, clock, meeting, replanned=due & ~failed, status=status, **others)
-        return meeting, Outlook(*outlook) if outlook else None, holds
+        outlook = Outlook(values["outlook"], values["outlook_age"]) if self._with_outlook else None
+        return meeting, outlook, holds
+
+    def _recall_kept(self, tensordict: TensorDictBase, target_pos: Tensor, step_count: Tensor) -> tuple[Tensor, ...]:
+        """What the plan before handed on, one step older."""
+        return ()
 
     def _look(self, values: Values, target_pos: Tensor, robot_state: Tensor, rows: Tensor) -> Drift:
         """How far the plan in use has drifted, in ``rows`` (*B,)."""

@@ -11,10 +11,13 @@ import torch
 from torch import Tensor
 
 from torchdyn_plan.checks import check_number, check_trailing_shape
+from torchdyn_plan.errors import InputError
+from torchdyn_plan.planners.odds import meeting_odds
 from torchdyn_plan.planners.search import SearchResult
 
 if TYPE_CHECKING:
     from torchdyn_plan.nets.eta import Arrival
+    from torchdyn_plan.nets.spread import Spread
 
 
 class Candidates(NamedTuple):
@@ -42,6 +45,10 @@ class ExactSearch:
     ``loyalty`` for the meeting that was planned before, which also needs no margin. Equal scores go to the earliest.
     With the defaults the first crossing of e(t) = t wins. If nothing is in time, the least late candidate gives the
     goal, and `reachable` is false.
+
+    With a ``caution`` the probability of meeting counts too: that the robot is there ``lead`` steps before the target
+    comes, by the whole distribution of the arrival time, and that the target is within the footprint then, by the
+    spread of the forecast.
     """
 
     stride: int = 5
@@ -69,13 +76,19 @@ class ExactSearch:
 
     Made for the first crossing. It costs meetings where a robot waits: beneath the tool arrival times are not smooth.
     """
+    caution: float = 0.0
+    """Score of a meeting that is certain over one that is impossible: with c, a probability that is higher by p is
+    worth c·p steps of stay, or c·p / ``patience`` steps of waiting. 0 takes the forecast and the mean arrival time as
+    they are."""
 
     def __post_init__(self) -> None:
         check_number("stride", self.stride, minimum=1, integer=True)
         check_number("coarse", self.coarse, minimum=1, integer=True)
         check_number("longest_stay", self.longest_stay, minimum=1, integer=True)
-        for name in ("lead", "margin", "footprint", "patience", "loyalty", "arrived"):
+        for name in ("lead", "margin", "footprint", "patience", "loyalty", "arrived", "caution"):
             check_number(name, getattr(self, name), minimum=0.0)
+        if self.caution > 0.0 and self.coarse > 1:
+            raise InputError(f"a caution needs all candidates at once: coarse must be 1 with it, got {self.coarse}")
         if self.half_extent is not None:
             check_number("half_extent", self.half_extent, minimum=0.0)
         if self.height is not None:
@@ -89,6 +102,7 @@ class ExactSearch:
         *,
         tool_pos: Tensor | None = None,
         planned_steps: Tensor | None = None,
+        spread: Spread | None = None,
     ) -> SearchResult:
         """Choose a meeting.
 
@@ -98,6 +112,7 @@ class ExactSearch:
             eta: maps goals ``(*B, K, 3)`` to arrivals ``(*B, K)``; called once, with the keyword ``reading``.
             tool_pos: ``(*B, 3)`` [m, world], to tell goals that are reached already; None to trust ``eta`` alone.
             planned_steps: ``(*B,)`` control steps from now to the meeting planned before; None if there is none.
+            spread: of the forecast, read with a ``caution``; None to be sure of it.
 
         Returns:
             The meeting; ``arrival_steps`` is when the target comes within the footprint.
@@ -113,14 +128,23 @@ class ExactSearch:
             kept = (comes - planned_steps.unsqueeze(-1)).abs() <= max(self.stride // 2, 1)
             score = score + self.loyalty * kept
 
-        def choose(needed: Tensor) -> tuple[Tensor, Tensor]:
+        def choose(needed: Tensor, gain: Tensor | float = 0.0) -> tuple[Tensor, Tensor]:
             early = comes - self.lead - needed
             slack = early - self.margin
             slack = slack if kept is None else torch.where(kept, early, slack)
-            return _best(score, slack, stay=stay, on_table=on_table)
+            return _best(score + gain, slack, stay=stay, on_table=on_table)
 
         ask = partial(self._needed, eta=eta, tool_pos=tool_pos)
-        best, reachable = choose(ask(goals)) if self.coarse == 1 else choose_nearby(choose, ask, goals, self.coarse)
+        if self.coarse > 1:
+            best, reachable = choose_nearby(choose, lambda some: ask(some)[0], goals, self.coarse)
+        else:
+            needed, arrival = ask(goals)
+            gain: Tensor | float = 0.0
+            if self.caution > 0.0:
+                gain = self.caution * self._odds(
+                    forecast, goals, comes - self.lead, arrival=arrival, needed=needed, spread=spread
+                )
+            best, reachable = choose(needed, gain)
         return SearchResult(
             goal=goals.gather(-2, best.unsqueeze(-1).expand(*best.shape, 3)).squeeze(-2),
             arrival_steps=comes.expand(goals.shape[:-1]).gather(-1, best).squeeze(-1),
@@ -130,24 +154,43 @@ class ExactSearch:
 
     def candidates(self, forecast: Tensor, target_pos: Tensor, horizon: int) -> Candidates:
         """Where and when the target could be met, whatever the robot needs; arguments as for a call."""
-        first = min(2, horizon)
-        steps = torch.arange(first, horizon + 1, self.stride, device=forecast.device)
-        places = forecast[..., first - 1 :: self.stride, :]
+        steps, places = self.places(forecast, horizon)
         goals, on_table = self.goals(places), places[..., 2] > 0.0
         if self.footprint == 0.0:
             return Candidates(goals, steps, 1 - self.patience * steps, None, on_table)
         path = torch.cat([target_pos.unsqueeze(-2), forecast], dim=-2)
-        before, stay = self.stays(path, goals, first)
+        before, stay = self.stays(path, goals, min(2, horizon))
         return Candidates(goals, steps - before, stay - self.patience * steps, stay, on_table)
 
-    def _needed(self, goals: Tensor, *, eta: Callable[..., Arrival], tool_pos: Tensor | None) -> Tensor:
-        """Control steps (*B, K) to each goal (*B, K, 3): infinitely many where the robot never arrives."""
-        arrival = eta(goals, reading="expectation")
+    def places(self, forecast: Tensor, horizon: int) -> tuple[Tensor, Tensor]:
+        """Steps ``(K,)`` of the candidates, and where the target is then, ``(*B, K, 3)`` [m, world]."""
+        first = min(2, horizon)
+        steps = torch.arange(first, horizon + 1, self.stride, device=forecast.device)
+        return steps, forecast[..., first - 1 :: self.stride, :]
+
+    def _odds(
+        self,
+        forecast: Tensor,
+        goals: Tensor,
+        time: Tensor,
+        *,
+        arrival: Arrival,
+        needed: Tensor,
+        spread: Spread | None,
+    ) -> Tensor:
+        """Probability of meeting the target at each goal (*B, K, 3) in ``time`` (*B, K) control steps: ``(*B, K)``."""
+        steps, places = self.places(forecast, forecast.shape[-2])
+        told, away = None if spread is None else spread.at(steps), (goals - places)[..., :2]
+        return meeting_odds(arrival, needed, time, told, away, half_width=self.footprint)
+
+    def _needed(self, goals: Tensor, *, eta: Callable[..., Arrival], tool_pos: Tensor | None) -> tuple[Tensor, Arrival]:
+        """Control steps (*B, K) to each goal (*B, K, 3), infinitely many where the robot never arrives; the arrival."""
+        arrival = eta(goals, reading="odds" if self.caution > 0.0 else "expectation")
         needed = arrival.steps.masked_fill(arrival.never, torch.inf)
         if tool_pos is None or self.arrived == 0.0:
-            return needed
+            return needed, arrival
         away = (goals - tool_pos.unsqueeze(-2))[..., :2].square().sum(-1)
-        return needed.masked_fill(away < self.arrived**2, 0.0)
+        return needed.masked_fill(away < self.arrived**2, 0.0), arrival
 
     def goals(self, places: Tensor) -> Tensor:
         """Where the tool is sent to meet a target at ``places`` (*B, 3) [m, world]."""

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
+from dataclasses import replace
+from typing import TYPE_CHECKING, Any, Self
 
 import torch
 from tensordict import TensorDict, TensorDictBase
@@ -10,13 +12,18 @@ from torch import Tensor
 
 from torchdyn_plan import keys
 from torchdyn_plan.checks import check_number
+from torchdyn_plan.errors import InputError
+from torchdyn_plan.planners.adaptation import Adaptation, Course
 from torchdyn_plan.planners.drop import Drop
-from torchdyn_plan.planners.dynamic import SUNK, DynamicPlanner
+from torchdyn_plan.planners.dynamic import PRETRAINED, SUNK, DynamicPlanner
 from torchdyn_plan.planners.exact import ExactSearch
-from torchdyn_plan.planners.latency import where_rows
+from torchdyn_plan.planners.latency import Delivery, where_rows
 from torchdyn_plan.planners.protocol import ArrivalPredictor, StaticPlanner
 from torchdyn_plan.planners.schedule import ReplanSchedule, Schedule
 from torchdyn_plan.planners.search import SearchResult
+
+if TYPE_CHECKING:
+    from torchdyn_plan.nets.spread import SpreadNetwork
 
 DROP_NAMES = ("drop_step", "tool_before")
 
@@ -27,6 +34,8 @@ WAITING = ExactSearch(
     loyalty=8.0, arrived=0.015,
 )  # fmt: skip
 """Meets Trapper's ball: waits with the rim 2 cm above it, as far out as the rails let the box stand."""
+CAUTIOUS = replace(WAITING, caution=30.0, margin=5.0)
+"""The same by the probability of meeting, which makes most of the margin needless; reads a spread."""
 
 
 class MeetingPlanner(DynamicPlanner):
@@ -51,6 +60,8 @@ class MeetingPlanner(DynamicPlanner):
         schedule: Schedule | None = None,
         latency: int = 0,
         drop: Drop | None = None,
+        adaptation: Adaptation | None = None,
+        spread: SpreadNetwork | None = None,
         table_height: float = 0.042,
         pull: float = 0.044,
         lead: int = 7,
@@ -68,6 +79,8 @@ class MeetingPlanner(DynamicPlanner):
                 its candidates on the same places of the path, and so the tool still while it waits.
             latency: as for `DynamicPlanner`. Whether to drop is decided at every step, on the forecast in use.
             drop: sizes and the descent of ``static``.
+            adaptation: how the forecast learns from its own errors; None to take it as it is.
+            spread: how sure the forecast is, from what ``forecaster`` describes, for a search with a ``caution``.
             table_height: height of a goal that brings the box down [m].
             pull: the goal of a dropping box is at most so far from it, sideways [m].
             lead: it is sent to where the target will be in so many steps: what ``static`` lags behind, and more.
@@ -87,9 +100,12 @@ class MeetingPlanner(DynamicPlanner):
         )
         self.search: ExactSearch
         self.drop, self.table_height, self.pull, self.lead = drop or Drop(), table_height, pull, lead
+        self.adaptation, self.spread = adaptation, spread
         check_number("lead", lead, minimum=0, maximum=self.drop.outlook - 1, integer=True)
         for name, value in (("table_height", table_height), ("pull", pull)):
             check_number(name, value, minimum=0.0)
+        self.kept_names = Course._fields if adaptation else ()
+        self.set_latency(latency)
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         """Plan where a plan is due, wait or drop, and act; raises what `DynamicPlanner.forward` raises."""
@@ -110,11 +126,69 @@ class MeetingPlanner(DynamicPlanner):
         tensordict.set(keys.GOAL, self._goal(meeting, path, tool_pos, drop_step))
         return self.static(tensordict)
 
-    def _choose(
-        self, robot_state: Tensor, forecast: Tensor, target_pos: Tensor, **tool_and_plan: Tensor
-    ) -> SearchResult:
+    @classmethod
+    def from_pretrained(
+        cls,
+        name: str,
+        *,
+        search: ExactSearch | None = None,
+        adaptation: Adaptation | None = None,
+        latency: int = 0,
+        chunk: int | None = None,
+    ) -> MeetingPlanner:
+        """As `DynamicPlanner.from_pretrained`; a ``search`` with a caution, `CAUTIOUS` for one, gets its spread."""
+        from torchdyn_plan.nets import SpreadNetwork
+
+        parts = DynamicPlanner.from_pretrained(name, chunk=chunk)
+        search = search or WAITING
+        spread = SpreadNetwork.from_pretrained(PRETRAINED[name][1]) if search.caution > 0.0 else None
+        planner = cls(
+            parts.static, parts.forecaster, parts.eta, search=search, adaptation=adaptation, spread=spread,
+            latency=latency, gone_below=parts.gone_below, chunk=chunk,
+        )  # fmt: skip
+        return planner.eval().requires_grad_(False)
+
+    def set_latency(self, latency: int, delivery: Delivery | None = None) -> None:
+        """As `DynamicPlanner.set_latency`; an adaptation needs plans that take effect at once: else an `InputError`."""
+        if self.kept_names and (latency or delivery):
+            raise InputError(f"an adaptation judges each plan from when it was made: latency must be 0, got {latency}")
+        super().set_latency(latency, delivery)
+
+    def folded(self) -> Self:
+        """As `DynamicPlanner.folded`; a forecaster that a spread reads is left as it is."""
+        other = super().folded()
+        if self.spread is not None:
+            other.forecaster = self.forecaster
+        return other
+
+    def _forecast(self, *seen: Tensor) -> tuple[Tensor, dict[str, Any]]:
+        """Forecast ``(R, F, 3)`` [m, world] and, if a search reads it, its spread from when the plan takes effect."""
+        if self.spread is None:
+            return super()._forecast(*seen)
+        describing: Any = self.forecaster
+        forecast, features, swapped = describing.describe(*seen)
+        return forecast, {"spread": self.spread(features, swapped).after(self.latency)}
+
+    def _adapt(self, forecast: Tensor, target_pos: Tensor, kept: Sequence[Tensor]) -> tuple[Tensor, Sequence[Tensor]]:
+        """The forecast with the drag that those before it showed."""
+        if self.adaptation is None:
+            return forecast, kept
+        return self.adaptation.adapt(forecast, target_pos, Course(*kept))
+
+    def _recall_kept(self, tensordict: TensorDictBase, target_pos: Tensor, step_count: Tensor) -> tuple[Tensor, ...]:
+        """Entries of the `Course`; none without an adaptation."""
+        if self.adaptation is None:
+            return ()
+        start, plan = self.adaptation.start(target_pos), tensordict.get(keys.PLAN, None)
+        if plan is None or plan.get(Course._fields[0], None) is None:
+            return start
+        before = Course(*map(plan.get, Course._fields))
+        before = before._replace(course_age=before.course_age + 1)
+        return tuple(where_rows(step_count == 0, *pair) for pair in zip(start, before, strict=True))
+
+    def _choose(self, robot_state: Tensor, forecast: Tensor, target_pos: Tensor, **hints: Any) -> SearchResult:
         """A place to wait at, which also depends on where the tool is and on the meeting planned before."""
-        return self.search(forecast, target_pos, self._arrival(robot_state), **tool_and_plan)
+        return self.search(forecast, target_pos, self._arrival(robot_state), **hints)
 
     @property
     def outlook_steps(self) -> int:

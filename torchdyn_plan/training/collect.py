@@ -110,19 +110,35 @@ def _paths(arguments: CollectArguments, scene: TrapperScene, index: int) -> dict
     """Balls rolled alone (the arm at home touches none), each at a velocity of its own up to `FASTEST`."""
     paths, speeds = [], []
     for episodes in _shard_rows(arguments, index):
-        simulation = TrapperSimulation(len(episodes), scene, num_threads=arguments.threads, arm=False)
         place, velocity = draw_starts(scene, episodes, velocity=1.0, split="train", seed=arguments.seed)
         draw = torch.Generator().manual_seed(arguments.seed * 1_000_003 + int(episodes[0]))
         speed = FASTEST * torch.rand(len(episodes), generator=draw, dtype=torch.float64)
-        simulation.reset(torch.arange(len(episodes)), place, velocity * speed.unsqueeze(-1))
-        record = torch.empty(len(episodes), PATH_STEPS + 1, 3)
-        record[:, 0] = simulation.ball_pos
-        for step in range(1, PATH_STEPS + 1):
-            simulation.step()
-            record[:, step] = simulation.ball_pos
-        paths.append(record)
+        paths.append(_record(scene, place, velocity * speed.unsqueeze(-1), PATH_STEPS, threads=arguments.threads))
         speeds.append(speed.float())
     return _flatten(torch.cat(paths), torch.cat(speeds), scene)
+
+
+def roll(
+    scene: TrapperScene, episodes: Tensor, *, steps: int, velocity: float, friction: float, split: str, seed: int
+) -> dict[str, Tensor]:
+    """Balls of ``episodes`` rolled alone for ``steps`` control steps, at ``friction`` [N]: entries as of a shard."""
+    place, speed = draw_starts(scene, episodes, velocity=velocity, split=split, seed=seed)
+    paths = _record(scene, place, speed, steps, friction=friction, threads=1)
+    return _flatten(paths, torch.full((len(episodes),), velocity), scene)
+
+
+def _record(
+    scene: TrapperScene, place: Tensor, velocity: Tensor, steps: int, *, friction: float = 0.0, threads: int
+) -> Tensor:
+    """Positions ``(M, steps + 1, 3)`` [m, world] of balls that start at ``place`` with ``velocity``, (M, 2) each."""
+    simulation = TrapperSimulation(len(place), scene, friction=friction, num_threads=threads, arm=False)
+    simulation.reset(torch.arange(len(place)), place, velocity)
+    record = torch.empty(len(place), steps + 1, 3)
+    record[:, 0] = simulation.ball_pos
+    for step in range(1, steps + 1):
+        simulation.step()
+        record[:, step] = simulation.ball_pos
+    return record
 
 
 def _flatten(paths: Tensor, speeds: Tensor, scene: TrapperScene) -> dict[str, Tensor]:

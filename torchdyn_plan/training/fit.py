@@ -80,7 +80,7 @@ def fit_forecaster(
         episodes = train[torch.randint(len(train), (batch,), generator=generator)]
         return line_loss(network, draw_windows(paths, last, episodes, drawing, generator, lines=lines))
 
-    windows = _held_windows(paths, last, held, drawing, seed)
+    windows = held_windows(paths, last, held, drawing, seed)
     settings = {"network": asdict(config), "scene": about["scene"], "episodes": len(paths.length)}
 
     def score() -> Tables:
@@ -96,7 +96,7 @@ def fit_forecaster(
     return _finish(network, folder, score, recipe, facts)
 
 
-def _held_windows(paths: Paths, last: Tensor, held: Tensor, drawing: WindowConfig, seed: int) -> Windows:
+def held_windows(paths: Paths, last: Tensor, held: Tensor, drawing: WindowConfig, seed: int) -> Windows:
     """`SCORED` windows with full histories and as many with padded ones, of the episodes ``held``."""
     draws = torch.Generator().manual_seed(seed)
     full = replace(drawing, first_step=drawing.history, early_share=0.0, shortened_share=0.0)

@@ -7,6 +7,7 @@ import torch
 from torch import Tensor
 
 from torchdyn_plan.nets.eta import READINGS
+from torchdyn_plan.nets.spread import Spread
 from torchdyn_plan.training.windows import Windows
 
 AHEAD = (25, 100, 300)
@@ -15,6 +16,10 @@ STILL = 0.05
 """Joint speed below which an arm is at rest [rad/s]."""
 FAST = 0.004
 """Motion from which a target is fast [m a step]."""
+SHARES = (0.5, 0.8, 0.9, 0.95)
+"""Probabilities of the intervals whose coverage is reported."""
+NEAR = 0.055
+"""Distance along both axes within which a waiting box has the target [m]."""
 SOON = 30
 """Arrivals within fewer steps than this are scored apart too."""
 
@@ -34,18 +39,9 @@ def forecast_errors(forecast: Tensor, windows: Windows) -> list[dict[str, Any]]:
         A row for each kind of window and each of `AHEAD`: ``windows, ahead, count, median, mean,
         constant_velocity`` (its median) [m]; errors are None where no window counts.
     """
-    padded = windows.history_length < windows.history.shape[-2]
-    stays, moving = ~windows.pocketed, windows.moving
     now, step = windows.history[:, -1], windows.history[:, -1] - windows.history[:, -2]
-    kinds = {
-        "full": moving & stays & ~padded,
-        "padded": moving & stays & padded,
-        "fast": moving & stays & (step.norm(dim=-1) >= FAST),
-        "pocketed": moving & windows.pocketed,
-        "still": ~moving,
-    }
     rows = []
-    for kind, chosen in kinds.items():
+    for kind, chosen in _kinds(windows).items():
         for ahead in (ahead for ahead in AHEAD if ahead <= forecast.shape[-2]):
             scored = chosen & windows.recorded[:, ahead - 1]
             truth = windows.future[scored, ahead - 1]
@@ -53,6 +49,64 @@ def forecast_errors(forecast: Tensor, windows: Windows) -> list[dict[str, Any]]:
             straight = (now[scored] + ahead * step[scored] - truth).norm(dim=-1)
             figures = {"median": _median(error), "mean": _mean(error), "constant_velocity": _median(straight)}
             rows.append({"windows": kind, "ahead": ahead, "count": int(scored.sum())} | figures)
+    return rows
+
+
+def _kinds(windows: Windows) -> dict[str, Tensor]:
+    """Masks ``(n,)`` of the windows that are scored together."""
+    padded = windows.history_length < windows.history.shape[-2]
+    stays, moving = ~windows.pocketed, windows.moving
+    step = windows.history[:, -1] - windows.history[:, -2]
+    return {
+        "full": moving & stays & ~padded,
+        "padded": moving & stays & padded,
+        "fast": moving & stays & (step.norm(dim=-1) >= FAST),
+        "pocketed": moving & windows.pocketed,
+        "still": ~moving,
+    }
+
+
+def coverage(forecast: Tensor, spread: Spread, windows: Windows) -> list[dict[str, Any]]:
+    """How often errors lie within the intervals that should hold a share of them, axes pooled.
+
+    Args:
+        forecast: ``(n, F, 3)`` [m, world].
+        spread: of the forecasts.
+        windows: of n targets, whose ``future`` is the path itself.
+
+    Returns:
+        A row for each kind of window (as `forecast_errors` tells them apart) and each of `AHEAD`: ``windows, ahead,
+        count, within_50, within_80, within_90, within_95`` shares of errors, the median ``half_width_90`` [m], and
+        the mean probability ``near_told`` of being within `NEAR` along both axes beside its share ``near``.
+    """
+    error = (forecast - windows.future)[..., :2].abs()
+    rows = []
+    for kind, chosen in _kinds(windows).items():
+        for ahead in (ahead for ahead in AHEAD if ahead <= forecast.shape[-2]):
+            scored = chosen & windows.recorded[:, ahead - 1]
+            told = Spread(*(part[scored, ahead - 1] for part in spread))
+            size = error[scored, ahead - 1]
+            held = {f"within_{100 * s:.0f}": _mean((size <= told.interval(s)).float().mean(-1)) for s in SHARES}
+            near = _mean((size <= NEAR).all(-1).float())
+            told_near = _mean(told.within(NEAR).prod(-1))
+            width = {"half_width_90": _median(told.interval(0.9).flatten()), "near_told": told_near, "near": near}
+            rows.append({"windows": kind, "ahead": ahead, "count": int(scored.sum())} | held | width)
+    return rows
+
+
+def swallowed_odds(spread: Spread, windows: Windows) -> list[dict[str, Any]]:
+    """Probability of being swallowed beside its share among moving targets, and its mean square error (Brier).
+
+    ``brier_share`` is that of always telling the share.
+    """
+    rows = []
+    for ahead in (ahead for ahead in AHEAD if ahead <= spread.gone.shape[-1]):
+        truth = (~windows.recorded[windows.moving, ahead - 1]).float()
+        told = spread.gone[windows.moving, ahead - 1]
+        brier, share = _mean((told - truth).square()), _mean(truth)
+        spare = None if share is None else share * (1.0 - share)
+        row = {"ahead": ahead, "count": len(truth), "told": _mean(told), "share": share}
+        rows.append(row | {"brier": brier, "brier_share": spare})
     return rows
 
 

@@ -1,0 +1,128 @@
+"""How far a forecast may be off: the distribution of its error at each future step, from what the forecaster saw."""
+
+from dataclasses import dataclass
+from typing import Any, NamedTuple
+
+import torch
+from torch import Tensor, nn
+
+from torchdyn_plan.checks import check_number, check_same_device, check_trailing_shape
+from torchdyn_plan.errors import InputError
+from torchdyn_plan.nets.pretrained import Pretrained
+
+
+class Spread(NamedTuple):
+    """Distribution of a forecast's error, along x and y on its own and symmetric about the forecast.
+
+    The size of the error is log-logistic, P(|e| ≤ r) = 1 / (1 + (scale/r)^shape): half of all errors are smaller than
+    ``scale``, and the tail is as heavy as r^-shape, for a forecast is either right or has missed a bounce.
+    """
+
+    scale: Tensor
+    """``(*B, F, 2)`` median of the error's size along x and y at 1 … F steps [m]."""
+    shape: Tensor
+    """``(*B, F, 2)`` how sharply it is known, positive."""
+    gone: Tensor
+    """``(*B, F)`` probability that the target has been swallowed by then."""
+
+    def at(self, steps: Tensor) -> "Spread":
+        """The spread ``steps`` (K,) control steps ahead, 1 to F each: ``(*B, K, 2)``, ``gone`` ``(*B, K)``."""
+        index = (steps - 1).clamp_min(0)
+        return Spread(self.scale[..., index, :], self.shape[..., index, :], self.gone[..., index])
+
+    def after(self, steps: int) -> "Spread":
+        """The spread from ``steps`` control steps ahead on: that of the forecast without its first entries."""
+        return Spread(self.scale[..., steps:, :], self.shape[..., steps:, :], self.gone[..., steps:])
+
+    def within(self, size: Tensor | float) -> Tensor:
+        """P(|e| ≤ size), ``(*B, F, 2)``, of sizes that broadcast against it [m]; 0 for sizes that are not positive."""
+        size = torch.as_tensor(size, dtype=self.scale.dtype, device=self.scale.device)
+        # A guard on both sides of the `where` keeps the gradient finite.
+        exponent = self.shape * (size.clamp_min(1e-12).log() - self.scale.log())
+        return torch.where(size > 0.0, exponent.sigmoid(), 0.0)
+
+    def between(self, offset: Tensor, half_width: Tensor | float) -> Tensor:
+        """P(|offset + e| ≤ half_width) along each axis, for a place that is ``offset`` from the forecast [m]."""
+        offset = offset.abs()
+        near, far = self.within(half_width + offset), self.within((half_width - offset).abs())
+        return 0.5 * (near + torch.where(offset <= half_width, far, -far))
+
+    def interval(self, share: float) -> Tensor:
+        """Half-width ``(*B, F, 2)`` of the interval about the forecast that holds the target with P = ``share`` [m]."""
+        check_number("share", share, minimum=1e-6, maximum=1.0 - 1e-6)
+        return self.scale * (share / (1.0 - share)) ** (1.0 / self.shape)
+
+
+@dataclass(frozen=True, kw_only=True)
+class SpreadConfig:
+    """Sizes of a `SpreadNetwork`."""
+
+    features: int = 384
+    """Width of the forecaster's hidden layer."""
+    horizon: int = 300
+    """Steps F that it judges, as many as the forecaster emits."""
+    hidden: int = 128
+    """Width of the layer between features and head."""
+    rank: int = 24
+    """Rank of the head."""
+    finest: float = 1e-5
+    """Errors are not told apart below this [m]; it is added to every error before its logarithm is taken."""
+
+    def __post_init__(self) -> None:
+        for name in ("features", "horizon", "hidden", "rank"):
+            check_number(name, getattr(self, name), minimum=1, integer=True)
+        check_number("finest", self.finest, minimum=1e-9)
+
+
+class SpreadNetwork(Pretrained, nn.Module):
+    """Adds a spread to a `Forecaster`, whose own positions it does not touch.
+
+    One hidden layer and a linear head of low rank on the forecaster's last hidden layer.
+    """
+
+    kind = "spread"
+    config_type = SpreadConfig
+
+    def __init__(self, config: SpreadConfig | None = None, **settings: Any) -> None:
+        """Build the network from ``config``, or from the fields of `SpreadConfig` given as keywords."""
+        super().__init__()
+        self.config = config = config or SpreadConfig(**settings)
+        self.hidden = nn.Linear(config.features, config.hidden)
+        self.mix = nn.Linear(config.hidden, config.rank)
+        self.head = nn.Linear(config.rank, 5 * config.horizon)
+        self.head.weight.data.mul_(0.1)
+        with torch.no_grad():
+            bias = self.head.bias.view(5, config.horizon)
+            ahead = torch.arange(1.0, config.horizon + 1.0)
+            bias[:2] = (1e-5 * ahead).log()
+            bias[2:] = torch.tensor([0.0, 0.0, -4.0]).unsqueeze(-1)
+
+    def forward(self, features: Tensor, swapped: Tensor) -> Spread:
+        """Spread of the forecasts that `Forecaster.describe` describes.
+
+        Args:
+            features: ``(*B, features)``.
+            swapped: ``(*B,)`` bool: x and y are exchanged.
+
+        Raises:
+            InputError: a shape or a device is wrong.
+        """
+        log_scale, log_shape, gone = self.raw(features, swapped)
+        return Spread(log_scale.exp(), log_shape.exp(), gone.sigmoid())
+
+    def raw(self, features: Tensor, swapped: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        """Logarithms of scale and shape (*B, F, 2) and the logit of being gone (*B, F): what training compares."""
+        if not torch.compiler.is_compiling():
+            self._check(features, swapped)
+        out = self.head(self.mix(self.hidden(features).relu()))
+        out = out.view(*features.shape[:-1], 5, self.config.horizon)
+        level = out[..., :4, :].unflatten(-2, (2, 2)).transpose(-1, -2)
+        level = torch.where(swapped[..., None, None, None], level.flip(-1), level)
+        return level[..., 0, :, :].clamp(-18.0, 4.0), level[..., 1, :, :].clamp(-3.0, 3.0), out[..., 4, :]
+
+    def _check(self, features: Tensor, swapped: Tensor) -> None:
+        check_trailing_shape("features", features, self.config.features)
+        check_same_device("features", features, self.head.weight.device, type(self).__name__)
+        if swapped.shape != features.shape[:-1] or swapped.dtype != torch.bool:
+            expected = f"bool of shape {tuple(features.shape[:-1])}"
+            raise InputError(f"swapped must be {expected}, got {swapped.dtype} of shape {tuple(swapped.shape)}")
