@@ -136,11 +136,11 @@ class MeetingPlanner(DynamicPlanner):
         latency: int = 0,
         chunk: int | None = None,
     ) -> MeetingPlanner:
-        """As `DynamicPlanner.from_pretrained`; a ``search`` with a caution, `CAUTIOUS` for one, gets its spread."""
+        """As `DynamicPlanner.from_pretrained`, with the search `CAUTIOUS`; one with a caution gets its spread."""
         from torchdyn_plan.nets import SpreadNetwork
 
         parts = DynamicPlanner.from_pretrained(name, chunk=chunk)
-        search = search or WAITING
+        search = search or CAUTIOUS
         spread = SpreadNetwork.from_pretrained(PRETRAINED[name][1]) if search.caution > 0.0 else None
         planner = cls(
             parts.static, parts.forecaster, parts.eta, search=search, adaptation=adaptation, spread=spread,
