@@ -99,7 +99,7 @@ def test_missing_weights_and_names_are_told(shipped, kind):
 
 
 def test_a_cautious_planner_by_name_gets_the_spread_and_another_needs_none(shipped, due):
-    planner = MeetingPlanner.from_pretrained("trapper-ik", chunk=4)
+    planner = MeetingPlanner.from_pretrained("trapper-ik", search=WAITING, chunk=4)
     assert (planner.search, planner.spread, planner.adaptation) == (WAITING, None, None)
     with pytest.raises(WeightsError, match="no weights 'trapper' for SpreadNetwork"):
         MeetingPlanner.from_pretrained("trapper-ik", search=CAUTIOUS)
