@@ -22,8 +22,9 @@ from torchdyn_plan.envs.scene import TrapperScene
 from torchdyn_plan.envs.trapper import MAX_STEPS, TrapperEnv
 from torchdyn_plan.evaluation.measured import MeasuredArrival
 from torchdyn_plan.evaluation.paper import paper_rate
+from torchdyn_plan.evaluation.planners import STATIC_CHUNK
 from torchdyn_plan.evaluation.results import EpisodeOutcomes, summarize
-from torchdyn_plan.evaluation.run import IK_CHUNK, EpisodeLog, record_truth
+from torchdyn_plan.evaluation.run import EpisodeLog, record_truth
 from torchdyn_plan.files import write_json
 from torchdyn_plan.planners import CornerSearch, DynamicPlanner, IKPlanner
 from torchdyn_plan.planners.baselines import RecordedFuture
@@ -46,7 +47,7 @@ class Arguments:
 
 def planners() -> dict[str, DynamicPlanner]:
     """Every combination of learned and true parts."""
-    learned = DynamicPlanner.from_pretrained("trapper-ik", chunk=IK_CHUNK)
+    learned = DynamicPlanner.from_pretrained("trapper-ik", chunk=STATIC_CHUNK)
     forecasts = {"network": learned.forecaster, "truth": RecordedFuture()}
     arrivals = {
         "network": (learned.eta, "mode"),
@@ -55,7 +56,11 @@ def planners() -> dict[str, DynamicPlanner]:
     }
     return {
         f"{forecast} | {arrival}": DynamicPlanner(
-            IKPlanner(chunk=IK_CHUNK), forecasts[forecast], eta, search=CornerSearch(reading=reading), chunk=IK_CHUNK
+            IKPlanner(chunk=STATIC_CHUNK),
+            forecasts[forecast],
+            eta,
+            search=CornerSearch(reading=reading),
+            chunk=STATIC_CHUNK,
         )
         for forecast in forecasts
         for arrival, (eta, reading) in arrivals.items()

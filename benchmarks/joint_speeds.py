@@ -12,7 +12,7 @@ from torch import Tensor
 from tqdm import tqdm
 
 from torchdyn_plan.envs import TrapperEnv, TrapperScene, TrapperSimulation
-from torchdyn_plan.evaluation.run import PLANNERS
+from torchdyn_plan.evaluation.planners import PLANNERS
 from torchdyn_plan.files import write_json
 from torchdyn_plan.kinematics import UR5_LINKS, UR5_SPEED_LIMIT
 from torchdyn_plan.versions import library_versions, machine

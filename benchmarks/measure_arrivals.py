@@ -9,7 +9,7 @@ import torch
 import tyro
 
 from torchdyn_plan.envs.scene import TrapperScene
-from torchdyn_plan.evaluation.run import static_planner
+from torchdyn_plan.evaluation.planners import static_planner
 from torchdyn_plan.evaluation.solvability import SHIPPED, arrivals_name, measure_arrivals, save_arrivals
 
 

@@ -52,17 +52,28 @@ def train(arguments: TrainArguments) -> None:
     from torchdyn_plan.checks import check_writable_folder
 
     check_writable_folder(arguments.out)
-    if arguments.what == "policy":
+    if arguments.what in ("policy", "dher"):
+        _train_policy(arguments)
+        return
+    from torchdyn_plan.training import fit, spread
+    from torchdyn_plan.training.tasks import FIT_TASKS
+
+    if arguments.what == "spread":
+        spread.fit_spread(arguments.data, arguments.out, **arguments.settings())
+        return
+    fits: dict[str, Callable[..., object]] = {"forecaster": fit.fit_forecaster, "eta": fit.fit_eta}
+    fits[arguments.what](arguments.data, arguments.out, task=FIT_TASKS[arguments.task](), **arguments.settings())
+
+
+def _train_policy(arguments: TrainArguments) -> None:
+    if arguments.task == "reach":
+        from torchdyn_plan.training.reach_policy import train_reach
+
+        train_reach(arguments)
+    else:
         from torchdyn_plan.training.policy import train_trapper
 
         train_trapper(arguments)
-        return
-    from torchdyn_plan.training import fit, spread
-
-    fits: dict[str, Callable[..., object]] = {
-        "forecaster": fit.fit_forecaster, "eta": fit.fit_eta, "spread": spread.fit_spread,
-    }  # fmt: skip
-    fits[arguments.what](arguments.data, arguments.out, **arguments.settings())
 
 
 def bench(arguments: BenchArguments) -> None:

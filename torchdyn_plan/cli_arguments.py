@@ -4,7 +4,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Literal
+from typing import Literal, NamedTuple
 
 from torchdyn_plan.errors import InputError, UsageError
 
@@ -12,7 +12,28 @@ PLANNERS = ("pursuit", "wait", "corner", "oracle", "exact", "meet")
 """Names of the planners for a moving target."""
 
 STATICS = ("ik", "rl")
-"""Names of the static planners."""
+"""Names of Trapper's static planners."""
+
+
+class Task(NamedTuple):
+    """What a task has to choose from; the first static planner is the one taken when none is named."""
+
+    planners: tuple[str, ...]
+    statics: tuple[str, ...]
+    fastest: float
+    """Greatest velocity of the target: m/s in Trapper, metres per control step in Reach."""
+    rivals: tuple[str, ...] = ()
+    """Planners that run only when they are named: their weights do not ship."""
+
+
+TASKS = {
+    "trapper": Task(PLANNERS, STATICS, 20.0),
+    "reach": Task(("pursuit", "corner", "oracle", "exact"), ("proportional", "rl"), 0.2, ("dher",)),
+}
+"""Tasks by name: Trapper, a UR5 that drops a box over a ball, and Reach, a Fetch arm that reaches a moving goal."""
+
+MOTIONS = ("straight", "circle", "random")
+"""How goals of Reach move."""
 
 CONTROL_STEP_MS = 4
 """Length of a control step [ms]."""
@@ -37,16 +58,14 @@ def _as_usage_error() -> Iterator[None]:
         raise UsageError(str(error)) from error
 
 
-def _check_names(planners: tuple[str, ...], static: str, split: str) -> None:
+def _check_names(task: str, planners: tuple[str, ...], static: str, split: str) -> None:
     from torchdyn_plan.checks import check_choice
 
-    if not planners:
-        raise InputError(f"planners must name at least one of {', '.join(PLANNERS)}")
     for planner in planners:
-        check_choice("planner", planner, PLANNERS)
+        check_choice("planner", planner, TASKS[task].planners + TASKS[task].rivals)
     if len(set(planners)) < len(planners):
         raise InputError(f"planners must be named once each, got {' '.join(planners)}")
-    check_choice("static planner", static, STATICS)
+    check_choice("static planner", static, TASKS[task].statics)
     check_choice("split", split, SPLITS)
 
 
@@ -59,11 +78,23 @@ def _check_counts(**counts: tuple[int | None, int]) -> None:
             check_number(name, value, minimum=minimum, integer=True)
 
 
-def _check_ball(velocity: float, friction: float) -> None:
-    from torchdyn_plan.checks import check_number
+def _check_target(task: str, velocity: float, friction: float, motion: str) -> None:
+    from torchdyn_plan.checks import check_choice, check_number
 
-    check_number("velocity", velocity, minimum=0.0, maximum=20.0)
+    check_number("velocity", velocity, minimum=0.0, maximum=TASKS[task].fastest)
     check_number("friction", friction, minimum=0.0)
+    check_choice("motion", motion, MOTIONS)
+    if task != "trapper" and friction:
+        raise InputError(f"friction is the ball's in Trapper: {task} has none, got {friction!r}")
+    if task != "reach" and motion != "straight":
+        raise InputError(f"motion is the goal's in reach: {task} has none, got {motion!r}")
+
+
+def _known_task(name: str) -> Task:
+    from torchdyn_plan.checks import check_choice
+
+    check_choice("task", name, TASKS)
+    return TASKS[name]
 
 
 def _check_latency(latency_ms: float) -> None:
@@ -78,14 +109,21 @@ def _check_latency(latency_ms: float) -> None:
 class EvaluateArguments:
     """Run episodes at one velocity and friction with each planner; print a table and write the results."""
 
+    task: str = "trapper"
+    """What the arm has to do: trapper or reach."""
     planners: tuple[str, ...] = PLANNERS
-    """Planners for the moving target: pursuit, wait, corner, oracle, exact, meet."""
-    static: str = "ik"
-    """Static planner that drives the arm: ik (inverse kinematics) or rl (a learned policy)."""
+    """Planners for the moving target: pursuit, wait, corner, oracle, exact, meet; Reach has no wait and no meet, and the
+    rival dher."""
+    static: str = ""
+    """Static planner that drives the arm: ik or rl (a learned policy) in Trapper, proportional or rl in Reach. The
+    first of the task's when not given."""
     velocity: float = 3.0
-    """Velocity of the ball at the start [m/s]."""
+    """Velocity of the ball at the start [m/s]; in Reach of the goal [m per control step], 0.001 to 0.051 in the paper.
+    """
     friction: float = 0.0
     """Friction loss of the ball [N]."""
+    motion: str = "straight"
+    """How the goal of Reach moves: straight, circle, or random (straight in any direction)."""
     episodes: int = 100
     """Number of episodes for each planner, always episodes 0 to N-1."""
     seed: int = 0
@@ -105,9 +143,18 @@ class EvaluateArguments:
 
     def __post_init__(self) -> None:
         with _as_usage_error():
-            _check_names(self.planners, self.static, self.split)
-            _check_ball(self.velocity, self.friction)
+            task = _known_task(self.task)
+            # Frozen, but for what is left to the task.
+            object.__setattr__(self, "static", self.static or task.statics[0])
+            if self.planners == PLANNERS:
+                object.__setattr__(self, "planners", task.planners)
+            if not self.planners:
+                raise InputError(f"planners must name at least one of {', '.join(task.planners)}")
+            _check_names(self.task, self.planners, self.static, self.split)
+            _check_target(self.task, self.velocity, self.friction, self.motion)
             _check_latency(self.latency_ms)
+            if self.latency_ms and self.task != "trapper":
+                raise InputError(f"latency is injected in trapper only, got latency_ms {self.latency_ms:g}")
             _check_counts(
                 episodes=(self.episodes, 1), seed=(self.seed, 0), num_envs=(self.num_envs, 1), threads=(self.threads, 0)
             )
@@ -128,14 +175,20 @@ class SweepArguments:
     """Folder of the sweep: its points, results.json and the plot. One that holds points already is continued."""
     values: tuple[float, ...] = ()
     """Velocities [m/s] or friction losses [N]; the paper's when none are given."""
+    task: str = "trapper"
+    """What the arm has to do: trapper, or reach, whose velocity alone varies."""
     planners: tuple[str, ...] = PLANNERS
-    """Planners for the moving target: pursuit, wait, corner, oracle, exact, meet."""
-    static: str = "ik"
-    """Static planner that drives the arm: ik (inverse kinematics) or rl (a learned policy)."""
+    """Planners for the moving target: pursuit, wait, corner, oracle, exact, meet; Reach has no wait and no meet, and the
+    rival dher."""
+    static: str = ""
+    """Static planner that drives the arm: ik or rl (a learned policy) in Trapper, proportional or rl in Reach. The
+    first of the task's when not given."""
     velocity: float = 3.0
     """Velocity of the ball when friction varies [m/s]."""
     friction: float = 0.0
     """Friction loss of the ball when velocity varies [N]."""
+    motion: str = "straight"
+    """How the goal of Reach moves: straight, circle, or random (straight in any direction)."""
     episodes: int = 100
     """Number of episodes for each planner, value and repeat."""
     repeats: int = 10
@@ -156,15 +209,22 @@ class SweepArguments:
             if len(set(self.values)) < len(self.values):
                 raise InputError(f"values must differ, got {' '.join(map(str, self.values))}")
             _check_counts(repeats=(self.repeats, 1))
+            if self.task == "reach" and self.over != "velocity":
+                raise InputError(f"over must be velocity in reach, got {self.over!r}")
         for value in (*self.values, None):
-            self.point(value, 0)
+            point = self.point(value, 0)
+            object.__setattr__(self, "static", point.static)
+            object.__setattr__(self, "planners", point.planners)
 
     def point(self, value: float | None, repeat: int) -> EvaluateArguments:
         """The evaluation at one value (None: the fixed ones) and repeat, with nothing written."""
+        fixed = 0.0 if self.task == "reach" else self.velocity
         return EvaluateArguments(
+            task=self.task,
+            motion=self.motion,
             planners=self.planners,
             static=self.static,
-            velocity=value if value is not None and self.over == "velocity" else self.velocity,
+            velocity=value if value is not None and self.over == "velocity" else fixed,
             friction=value if value is not None and self.over == "friction" else self.friction,
             episodes=self.episodes,
             seed=self.seed + repeat,
@@ -179,11 +239,13 @@ class CollectArguments:
     """Gather training data: paths of the rolling ball, or arrival times of a static planner."""
 
     what: Literal["paths", "arrivals"]
-    """Paths of the ball for the forecaster, or arrivals of the arm for the arrival-time network."""
+    """Paths of the target for the forecaster, or arrivals of the arm for the arrival-time network."""
+    task: str = "trapper"
+    """What the arm has to do: trapper or reach."""
     out: Path = Path("runs/data")
     """Folder for the shards of data."""
-    static: str = "ik"
-    """Static planner whose arrivals are measured: ik or rl."""
+    static: str = ""
+    """Static planner whose arrivals are measured: ik or rl in Trapper, proportional or rl in Reach."""
     weights: Path | None = None
     """Policy of the static planner rl: a file, or a folder of its training; the one that ships when not given."""
     episodes: int = 20000
@@ -199,7 +261,9 @@ class CollectArguments:
         from torchdyn_plan.checks import check_choice
 
         with _as_usage_error():
-            check_choice("static planner", self.static, STATICS)
+            task = _known_task(self.task)
+            object.__setattr__(self, "static", self.static or task.statics[0])
+            check_choice("static planner", self.static, task.statics)
             if self.weights is not None and (self.static, self.what) != ("rl", "arrivals"):
                 raise InputError(f"weights are of a policy: they go with arrivals of --static rl, got {self.static}")
             _check_counts(
@@ -211,9 +275,12 @@ class CollectArguments:
 class TrainArguments:
     """Train a network, on collected data or by trial; a killed run continues where its folder stands."""
 
-    what: Literal["forecaster", "eta", "spread", "policy"]
-    """Which network: forecaster (paths of the ball), eta (arrival times of the arm), spread (how far the forecaster
-    that ships is off, on paths of the ball) or policy (by DDPG and HER)."""
+    what: Literal["forecaster", "eta", "spread", "policy", "dher"]
+    """Which network: forecaster (paths of the target), eta (arrival times of the arm), spread (how far the forecaster
+    that ships is off, on paths of the ball), policy (by DDPG and HER) or, in Reach, dher (a policy for goals that move,
+    by DDPG and DHER)."""
+    task: str = "trapper"
+    """What the arm has to do: trapper or reach."""
     data: Path = Path("runs/data")
     """Folder of the collected shards; a policy needs none."""
     out: Path = Path("runs/training")
@@ -230,6 +297,8 @@ class TrainArguments:
     """Where to train: cpu, cuda, cuda:1, …"""
     resume: bool = True
     """Continue from the checkpoint in the folder, if there is one."""
+    velocity: float = 0.011
+    """Of dher: velocity of the goals [m per control step]."""
     num_envs: int | None = None
     """Of a policy: episodes that run side by side; the recipe's own when not given."""
     period: int = 5
@@ -243,6 +312,10 @@ class TrainArguments:
         from torchdyn_plan.checks import check_number
 
         with _as_usage_error():
+            _known_task(self.task)
+            if self.what == "dher" and self.task != "reach":
+                raise InputError(f"dher is trained in reach alone: give --task reach, got {self.task!r}")
+            check_number("velocity", self.velocity, minimum=0.0, maximum=TASKS["reach"].fastest)
             _check_counts(
                 steps=(self.steps, 1), batch=(self.batch, 1), seed=(self.seed, 0), num_envs=(self.num_envs, 1),
                 period=(self.period, 1), threads=(self.threads, 0), workers=(self.workers, 0),

@@ -20,6 +20,7 @@ ARRIVAL_STEPS = "arrival_steps"
 ACTION = "action"
 TRAPPED = "trapped"
 POCKETED = "pocketed"
+REACHED = "reached"
 EPISODE = "episode"
 PLAN = "plan"
 
@@ -50,6 +51,7 @@ KEYS: tuple[Key, ...] = (
     Key(name=STEP_COUNT, shape=(), meaning="control steps since the reset", writer="env"),
     Key(name=TRAPPED, shape=(1,), meaning="the target is covered and kept", writer="env"),
     Key(name=POCKETED, shape=(1,), meaning="the target fell into a pocket", writer="env"),
+    Key(name=REACHED, shape=(1,), meaning="the tool has been at the target in this episode", writer="reach env"),
     Key(name=EPISODE, shape=(), meaning="index of the episode within its split and seed", writer="env"),
     Key(name=GOAL, shape=(3,), meaning="place the static planner is sent to [m, world]", writer="planner"),
     Key(name=ARRIVAL_STEPS, shape=(), meaning="control steps from now to the meeting", writer="planner"),

@@ -94,15 +94,11 @@ def test_expectation_of_perfect_targets_has_no_error_and_no_bias():
 
 
 def test_arrival_groups_by_hand():
-    state = torch.zeros(3, 15)
-    state[1, 7], state[2, 0] = -1.0, 5.0
-    goal = torch.tensor([[0.0, 0.0, 0.03], [0.0, 0.0, 0.2], [0.0, 0.0, 0.047]])
-    groups = arrival_groups(state, goal, torch.tensor([29, 30, -1]), table_goal=0.047)
+    rest = torch.tensor([True, False, True])
+    groups = arrival_groups(torch.tensor([29, 30, -1]), rest)
     assert {name: mask.tolist() for name, mask in groups.items()} == {
         "all": [True, True, True],
         "soon": [True, False, False],
-        "on table": [True, False, True],
-        "above table": [False, True, False],
         "at rest": [True, False, True],
         "in motion": [False, True, False],
     }

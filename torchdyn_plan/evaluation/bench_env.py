@@ -14,7 +14,8 @@ from torch import Tensor
 from torchdyn_plan import keys
 from torchdyn_plan.envs.simulation import TrapperSimulation
 from torchdyn_plan.envs.trapper import MAX_STEPS, TrapperEnv
-from torchdyn_plan.evaluation.run import PLANNERS, EpisodeLog, Planner, one_thread, play
+from torchdyn_plan.evaluation.planners import PLANNERS, Planner
+from torchdyn_plan.evaluation.run import EpisodeLog, one_thread, play
 from torchdyn_plan.evaluation.timing import figures
 from torchdyn_plan.versions import usable_cores
 

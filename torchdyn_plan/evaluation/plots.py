@@ -5,7 +5,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from torchdyn_plan.evaluation.intervals import Rate
-from torchdyn_plan.evaluation.paper import Sweep, paper_curve
+from torchdyn_plan.evaluation.paper import Sweep, paper_curve, paper_reach
 from torchdyn_plan.evaluation.results import ResultRow
 from torchdyn_plan.files import write_whole
 
@@ -20,14 +20,18 @@ COLOURS = {
     "exact": "#CC79A7",
     "meet": "#E69F00",
     "wait": "#56B4E9",
+    "dher": "#56B4E9",
 }
 """The colour of each planner: the palette of Okabe and Ito, told apart by colour-blind readers too."""
 
-MARKERS = {"pursuit": "s", "corner": "o", "oracle": "^", "exact": "D", "meet": "v", "wait": "P"}
+MARKERS = {
+    "pursuit": "s", "corner": "o", "oracle": "^", "exact": "D", "meet": "v", "wait": "P", "dher": "P",
+}  # fmt: skip
 
 _GREY = "#555555"
 _PALETTE = ("#0072B2", "#56B4E9", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#000000")
 _PANELS = (("all episodes", False), ("solvable episodes", True))
+_REACH_AXIS = "velocity of the goal [m per control step]"
 _AXES = {"velocity": "velocity of the ball [m/s]", "friction": "friction loss of the ball [N]"}
 
 
@@ -52,9 +56,8 @@ def plot_results(rows: Sequence[ResultRow], path: Path) -> None:
         panels[0].plot([], [], "|", color=_GREY, markersize=10, markeredgewidth=2, label="paper")
         figure.legend(loc="outside lower center", frameon=False)
     row = rows[0]
-    figure.suptitle(
-        f"{row.task}, {row.static} planner, {row.velocity:g} m/s, friction {row.friction:g}, {row.episodes} episodes"
-    )
+    unit = "m a step" if row.task == "reach" else f"m/s, friction {row.friction:g}"
+    figure.suptitle(f"{row.task}, {row.static} planner, {row.velocity:g} {unit}, {row.episodes} episodes")
     _save(figure, path)
 
 
@@ -80,6 +83,33 @@ def plot_sweep(rows: Sequence[ResultRow], over: Sweep, path: Path) -> None:
     panels[0].plot([], [], "--", color=_GREY, label="paper")
     handles, labels = panels[0].get_legend_handles_labels()
     figure.legend(handles, labels, loc="outside lower center", ncols=len(labels), frameon=False)
+    _save(figure, path)
+
+
+def plot_reach(rows: Sequence[ResultRow], path: Path) -> None:
+    """Success on Reach over the goal's velocity beside the paper's Figure 5: its planner and DHER dashed.
+
+    The grey line is the ceiling: the share of episodes that a search which knows the goal's path solves.
+
+    Args:
+        rows: one row for each planner and velocity.
+        path: file to write; its ending chooses the format.
+
+    Raises:
+        OutputError: the file cannot be written.
+    """
+    figure, (axes,) = _panels(height=4.6, count=1)
+    ceiling = sorted({(row.velocity, row.solvable) for row in rows})
+    axes.plot(*zip(*ceiling, strict=True), color=_GREY, linewidth=3, alpha=0.4, label="ceiling")
+    for planner in dict.fromkeys(row.planner for row in rows):
+        mine = sorted((row for row in rows if row.planner == planner), key=lambda row: row.velocity)
+        _draw_curve(axes, mine, "velocity", solvable=False)
+    if rows[0].motion == "straight":
+        for method, colour, name in (("dynamic", COLOURS["corner"], "paper"), ("dher", _GREY, "paper, DHER")):
+            axes.plot(*paper_reach(method), "--", color=colour, linewidth=1.2, label=name)
+    axes.set(title=f"Reach, goals move {rows[0].motion}", ylim=(0, 1.02), xlabel=_REACH_AXIS, ylabel="success rate")
+    axes.grid(alpha=0.3)
+    figure.legend(loc="outside right center", frameon=False)
     _save(figure, path)
 
 
@@ -152,7 +182,7 @@ def _draw_curve(axes: "Axes", rows: Sequence[ResultRow], over: Sweep, solvable: 
         markersize=4,
         label=planner,
     )
-    paper = paper_curve(planner, static, over, solvable=solvable)
+    paper = None if rows[0].task == "reach" else paper_curve(planner, static, over, solvable=solvable)
     if paper is not None:
         axes.plot(*paper, "--", color=colour, linewidth=1.0, alpha=0.8)
 

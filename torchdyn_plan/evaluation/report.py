@@ -8,6 +8,7 @@ from torchdyn_plan.evaluation.results import ResultRow
 
 def format_table(rows: Sequence[ResultRow]) -> str:
     """One aligned table of text: a line a row, rates in per cent, the paper's figure beside ours, ``–`` for none."""
+    reach = rows[0].task == "reach"
     varying = [name for name in ("static", "velocity", "friction") if len({getattr(row, name) for row in rows}) > 1]
     others = [name for row in rows for name in row.failures]
     # Results of old know other causes.
@@ -19,7 +20,7 @@ def format_table(rows: Sequence[ResultRow]) -> str:
         ("paper", lambda row: _percent(row.paper_success)),
         ("of solvable [95 %]", lambda row: _rate(row.success_solvable, row.success_solvable_ci)),
         ("paper", lambda row: _percent(row.paper_success_solvable)),
-        ("steps to trap", lambda row: _number(row.steps_to_trap, 0)),
+        ("steps to reach" if reach else "steps to trap", lambda row: _number(row.steps_to_trap, 1 if reach else 0)),
         ("re-plans", lambda row: _number(row.replans, 1)),
         *((cause.replace("_", " "), lambda row, cause=cause: _percent(row.failures.get(cause))) for cause in causes),
     ]
@@ -34,6 +35,8 @@ def _title(rows: Sequence[ResultRow], varying: Sequence[str]) -> str:
     row = rows[0]
     shared = {"static": f"static planner {row.static}", "velocity": f"velocity {row.velocity:g} m/s",
               "friction": f"friction {row.friction:g}"}  # fmt: skip
+    if row.task == "reach":
+        shared |= {"velocity": f"velocity {row.velocity:g} m a step", "friction": f"motion {row.motion}"}
     parts = [row.task, *(text for name, text in shared.items() if name not in varying), _span(rows, "episodes", "d")]
     if not {"velocity", "friction"} & set(varying):
         parts.append(f"{100 * row.solvable:.0f} % solvable")

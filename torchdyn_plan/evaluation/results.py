@@ -3,6 +3,7 @@
 import dataclasses
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -130,12 +131,22 @@ class ResultRow:
     """The paper's success rate over all episodes at this setting; None where it has none."""
     paper_success_solvable: float | None
     """The paper's success rate over solvable episodes at this setting; None where it has none."""
+    motion: str = "straight"
+    """How the goal of Reach moves."""
 
 
 def summarize(
-    outcomes: EpisodeOutcomes, *, planner: str, static: str, velocity: float, friction: float, task: str = "trapper"
+    outcomes: EpisodeOutcomes,
+    *,
+    planner: str,
+    static: str,
+    velocity: float,
+    friction: float,
+    task: str = "trapper",
+    motion: str = "straight",
 ) -> ResultRow:
     """Reduce the episodes of one planner at one setting to rates, means and causes of failure."""
+    paper = partial(paper_rate_at, planner, static, velocity, friction, task=task, motion=motion)
     trapped, solvable = outcomes.trapped, outcomes.solvable
     everything = rate(int(trapped.sum()), outcomes.episodes)
     possible = rate(int((trapped & solvable).sum()), int(solvable.sum()))
@@ -155,8 +166,9 @@ def summarize(
         replans=outcomes.replans.double().mean().item(),
         failures=failure_shares(outcomes.cause),
         episodes_per_second=outcomes.episodes / outcomes.seconds if outcomes.seconds > 0 else None,
-        paper_success=paper_rate_at(planner, static, velocity, friction, solvable=False),
-        paper_success_solvable=paper_rate_at(planner, static, velocity, friction, solvable=True),
+        paper_success=paper(solvable=False),
+        paper_success_solvable=paper(solvable=True),
+        motion=motion,
     )
 
 

@@ -4,77 +4,43 @@ from __future__ import annotations
 
 import dataclasses
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
 import torch
 from tensordict import TensorDict, TensorDictBase
-from tensordict.nn import TensorDictModuleBase
 from torch import Tensor
 
 from torchdyn_plan import keys
 from torchdyn_plan.cli_arguments import EvaluateArguments
 from torchdyn_plan.envs.episodes import draw_starts
+from torchdyn_plan.envs.fetch import fetch_digest
 from torchdyn_plan.envs.scene import TrapperScene
 from torchdyn_plan.envs.trapper import MAX_STEPS, TrapperEnv
 from torchdyn_plan.evaluation.evidence import Evidence, find_evidence
 from torchdyn_plan.evaluation.latency import delay_plans
+from torchdyn_plan.evaluation.planners import PLANNERS, Planner, static_planner
 from torchdyn_plan.evaluation.plots import plot_results
+from torchdyn_plan.evaluation.reach import run_reach
 from torchdyn_plan.evaluation.report import format_table
 from torchdyn_plan.evaluation.results import EpisodeOutcomes, summarize, write_results
 from torchdyn_plan.evaluation.solvability import arrival_map, is_solvable, record_path
 from torchdyn_plan.evaluation.traces import TraceLog
-from torchdyn_plan.planners import (
-    STATIC_PLANNERS,
-    DynamicPlanner,
-    ExactSearch,
-    MeetingPlanner,
-    OracleTrajectory,
-    TargetPursuit,
-    WaitAtEnd,
-)
-from torchdyn_plan.planners.protocol import GoalSearch
 
-Planner = Callable[[TensorDictBase], TensorDictBase]
-
-CHUNK = 32
-"""Rows that a network sees at once, whatever the number of environments: few, as few plan at the same step."""
-IK_CHUNK = 64
-"""Rows that the inverse kinematics sees at once, whatever the number of environments."""
 HORIZON = 300
 """Control steps that the recorded truth goes on after the end of an episode."""
-
-PLANNERS: dict[str, Callable[[str], Planner]] = {
-    "pursuit": lambda static: TargetPursuit(static_planner(static)),
-    "wait": lambda static: _pretrained(WaitAtEnd, static),
-    "corner": lambda static: _pretrained(DynamicPlanner, static),
-    "oracle": lambda static: _pretrained(OracleTrajectory, static),
-    "exact": lambda static: _pretrained(DynamicPlanner, static, search=ExactSearch()),
-    "meet": lambda static: _pretrained(MeetingPlanner, static),
-}
-"""The planners for a moving target by name, on the static planner of a given name."""
-
-
-def static_planner(name: str) -> TensorDictModuleBase:
-    """The static planner of that name, whose results do not depend on the number of environments."""
-    return STATIC_PLANNERS[name](chunk=IK_CHUNK)
-
-
-def _pretrained(kind: type[DynamicPlanner], static: str, *, search: GoalSearch | None = None) -> DynamicPlanner:
-    planner = kind.from_pretrained(f"trapper-{static}", chunk=CHUNK)
-    planner.static, planner.search = static_planner(static), search or planner.search
-    return planner
 
 
 def evaluate(arguments: EvaluateArguments) -> None:
     """Run the episodes, print one table, and write results and a plot where ``arguments.out`` says."""
     outcomes = run_points(arguments)
-    setting = {"static": arguments.static, "velocity": arguments.velocity, "friction": arguments.friction}
+    setting = {name: getattr(arguments, name) for name in ("task", "static", "velocity", "friction", "motion")}
     rows = [summarize(outcome, planner=name, **setting) for name, outcome in outcomes.items()]
     print(format_table(rows))
     if arguments.out is not None:
-        config = dataclasses.asdict(arguments) | {"out": str(arguments.out), "scene": TrapperScene().digest()}
+        scene = fetch_digest() if arguments.task == "reach" else TrapperScene().digest()
+        config = dataclasses.asdict(arguments) | {"out": str(arguments.out), "scene": scene}
         write_results(arguments.out, config, rows, outcomes)
         plot_results(rows, arguments.out / "results.png")
         print(f"\nwritten: {', '.join(str(path) for path in sorted(Path(arguments.out).iterdir()))}")
@@ -83,7 +49,9 @@ def evaluate(arguments: EvaluateArguments) -> None:
 def run_points(arguments: EvaluateArguments) -> dict[str, EpisodeOutcomes]:
     """Outcomes of the same episodes for each planner that ``arguments`` name."""
     with one_thread():
-        planners = {name: PLANNERS[name](arguments.static) for name in arguments.planners}
+        planners = {name: PLANNERS[name](arguments.static, arguments.task) for name in arguments.planners}
+        if arguments.task == "reach":
+            return run_reach(planners, arguments)
         for planner in planners.values():
             delay_plans(planner, arguments.latency_steps, told=arguments.compensate)
         future, solvable = record_truth(arguments)

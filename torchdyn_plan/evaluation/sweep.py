@@ -9,8 +9,8 @@ from typing import Any
 from torchdyn_plan.checks import check_writable_folder
 from torchdyn_plan.cli_arguments import EvaluateArguments, SweepArguments
 from torchdyn_plan.errors import InputError
-from torchdyn_plan.evaluation.paper import paper_curve
-from torchdyn_plan.evaluation.plots import plot_sweep
+from torchdyn_plan.evaluation.paper import paper_curve, paper_reach
+from torchdyn_plan.evaluation.plots import plot_reach, plot_sweep
 from torchdyn_plan.evaluation.results import EpisodeOutcomes, ResultRow, summarize, write_results
 from torchdyn_plan.files import write_json
 from torchdyn_plan.versions import library_versions
@@ -41,7 +41,10 @@ def sweep(arguments: SweepArguments, run_point: RunPoint) -> list[ResultRow]:
     _run_missing_points(arguments, run_point)
     rows = [row for value in _values(arguments) for row in _rows_at(arguments, value)]
     write_results(arguments.out, _config(arguments), rows)
-    plot_sweep(rows, arguments.over, arguments.out / "sweep.png")
+    if arguments.task == "reach":
+        plot_reach(rows, arguments.out / "sweep.png")
+    else:
+        plot_sweep(rows, arguments.over, arguments.out / "sweep.png")
     return rows
 
 
@@ -49,6 +52,8 @@ def _values(arguments: SweepArguments) -> list[float]:
     """The values asked for, or those of the paper's figure."""
     if arguments.values:
         return sorted(arguments.values)
+    if arguments.task == "reach":
+        return paper_reach("dynamic")[0]
     curve = paper_curve("corner", arguments.static, arguments.over, solvable=False)
     return [] if curve is None else curve[0]
 
@@ -66,7 +71,7 @@ def _claim_folder(arguments: SweepArguments) -> None:
     if not path.exists():
         write_json(path, identity)
         return
-    there = _read_json(path)
+    there = {"task": "trapper", "motion": "straight"} | _read_json(path)
     for name in (*identity, *there):
         if there.get(name) != identity.get(name):
             raise InputError(
@@ -102,11 +107,13 @@ def _rows_at(arguments: SweepArguments, value: float) -> list[ResultRow]:
         summarize(
             EpisodeOutcomes.merge([point[planner] for point in points]),
             planner=planner,
-            static=arguments.static,
+            static=setting.static,
             velocity=setting.velocity,
             friction=setting.friction,
+            task=arguments.task,
+            motion=arguments.motion,
         )
-        for planner in arguments.planners
+        for planner in setting.planners
     ]
 
 

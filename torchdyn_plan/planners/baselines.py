@@ -114,6 +114,9 @@ class OracleTrajectory(DynamicPlanner):
     def from_pretrained(cls, name: str, *, latency: int = 0, chunk: int | None = None) -> OracleTrajectory:
         """The planner of that name with the recorded truth in place of its forecaster; raises what that one raises."""
         planner = DynamicPlanner.from_pretrained(name, chunk=chunk)
-        oracle = cls(planner.static, planner.eta, latency=latency, chunk=chunk)
+        horizon = getattr(getattr(planner.forecaster, "config", None), "horizon", 300)
+        oracle = cls(
+            planner.static, planner.eta, schedule=planner.schedule, horizon=horizon, latency=latency, chunk=chunk
+        )
         oracle.gone_below = planner.gone_below
         return oracle.eval().requires_grad_(False)

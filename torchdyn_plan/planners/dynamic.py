@@ -22,22 +22,27 @@ from torchdyn_plan.planners.latency import AtOnce, Delayed, Delivery, Job, Value
 from torchdyn_plan.planners.memory import MEMORY_KEYS, USABLE, carry_on, carry_use, recall, remember
 from torchdyn_plan.planners.outlook import OUTLOOK_NAMES, Outlook, cut, recall_outlook
 from torchdyn_plan.planners.policy import PolicyPlanner
+from torchdyn_plan.planners.proportional import ProportionalController
 from torchdyn_plan.planners.protocol import ArrivalPredictor, GoalSearch, StaticPlanner, keys_read, keys_written, read
 from torchdyn_plan.planners.rows import apply_to_rows
 from torchdyn_plan.planners.schedule import Drift, ReplanSchedule, Schedule
 from torchdyn_plan.planners.search import CornerSearch, SearchResult
 from torchdyn_plan.planners.status import held, input_status, plan_status, try_again, usable_forecast
 
-STATIC_PLANNERS: dict[str, Callable[..., TensorDictModuleBase]] = {
-    "ik": IKPlanner,
-    "rl": partial(PolicyPlanner.from_pretrained, "trapper"),
+STATIC_PLANNERS: dict[str, dict[str, Callable[..., TensorDictModuleBase]]] = {
+    "trapper": {"ik": IKPlanner, "rl": partial(PolicyPlanner.from_pretrained, "trapper")},
+    "reach": {"proportional": ProportionalController, "rl": partial(PolicyPlanner.from_pretrained, "reach")},
 }
-"""What makes the static planners that ship, by name; each takes ``chunk``."""
-PRETRAINED = {f"trapper-{name}": (name, "trapper", f"trapper-{name}") for name in STATIC_PLANNERS}
-"""Name → names of the static planner, of the forecaster's weights, and of the ETA network's weights."""
+"""What makes the static planners that ship, by task and name; each takes ``chunk``."""
+PRETRAINED = {f"{task}-{name}": (task, name) for task, names in STATIC_PLANNERS.items() for name in names}
+"""Name of a planner → its task, which names the forecaster's weights, and the name of its static planner."""
+SCHEDULES = {"reach": ReplanSchedule.every(1, first_step=0)}
+"""When to plan anew where it is not the paper's schedule, by task."""
 
 SUNK = -0.042
 """A ball of Trapper whose centre is lower is in a pocket [m, world]."""
+GONE_BELOW = {"trapper": SUNK}
+"""Height below which a target has left the table [m, world], by task."""
 
 
 class DynamicPlanner(TensorDictModuleBase):
@@ -279,7 +284,7 @@ class DynamicPlanner(TensorDictModuleBase):
 
     @classmethod
     def from_pretrained(cls, name: str, *, latency: int = 0, chunk: int | None = None) -> DynamicPlanner:
-        """A planner with the weights that ship with the package: ``"trapper-ik"`` or ``"trapper-rl"``.
+        """A planner with the weights that ship with the package, as ``"trapper-ik"`` or ``"reach-proportional"``.
 
         ``latency`` is as in `set_latency`.
 
@@ -290,8 +295,9 @@ class DynamicPlanner(TensorDictModuleBase):
         check_choice("planner", name, PRETRAINED)
         from torchdyn_plan.nets import ETANetwork, Forecaster
 
-        static, forecaster, eta = PRETRAINED[name]
-        networks = Forecaster.from_pretrained(forecaster), ETANetwork.from_pretrained(eta)
-        planner = cls(STATIC_PLANNERS[static](chunk=chunk), *networks, latency=latency, chunk=chunk)
-        planner.gone_below = SUNK
+        task, static = PRETRAINED[name]
+        networks = Forecaster.from_pretrained(task), ETANetwork.from_pretrained(name)
+        planner = cls(STATIC_PLANNERS[task][static](chunk=chunk), *networks, latency=latency, chunk=chunk)
+        planner.schedule = SCHEDULES.get(task, planner.schedule)
+        planner.gone_below = GONE_BELOW.get(task, -math.inf)
         return planner.eval().requires_grad_(False)

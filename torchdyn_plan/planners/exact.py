@@ -53,6 +53,8 @@ class ExactSearch:
 
     stride: int = 5
     """Control steps between candidates; an arrival bin's width loses nothing."""
+    first: int = 2
+    """Step of the first candidate; the middle of the first arrival bin."""
     height: float | None = None
     """Height of the goals, above the table to wait there [m]; None for the target's own."""
     half_extent: float | None = None
@@ -84,6 +86,7 @@ class ExactSearch:
     def __post_init__(self) -> None:
         check_number("stride", self.stride, minimum=1, integer=True)
         check_number("coarse", self.coarse, minimum=1, integer=True)
+        check_number("first", self.first, minimum=0, integer=True)
         check_number("longest_stay", self.longest_stay, minimum=1, integer=True)
         for name in ("lead", "margin", "footprint", "patience", "loyalty", "arrived", "caution"):
             check_number(name, getattr(self, name), minimum=0.0)
@@ -141,9 +144,10 @@ class ExactSearch:
             needed, arrival = ask(goals)
             gain: Tensor | float = 0.0
             if self.caution > 0.0:
-                gain = self.caution * self._odds(
-                    forecast, goals, comes - self.lead, arrival=arrival, needed=needed, spread=spread
-                )
+                steps, places = self.places(forecast, target_pos, horizon)
+                told, away = None if spread is None else spread.at(steps), (goals - places)[..., :2]
+                odds = meeting_odds(arrival, needed, comes - self.lead, told, away, half_width=self.footprint)
+                gain = self.caution * odds
             best, reachable = choose(needed, gain)
         return SearchResult(
             goal=goals.gather(-2, best.unsqueeze(-1).expand(*best.shape, 3)).squeeze(-2),
@@ -154,34 +158,22 @@ class ExactSearch:
 
     def candidates(self, forecast: Tensor, target_pos: Tensor, horizon: int) -> Candidates:
         """Where and when the target could be met, whatever the robot needs; arguments as for a call."""
-        steps, places = self.places(forecast, horizon)
+        steps, places = self.places(forecast, target_pos, horizon)
         goals, on_table = self.goals(places), places[..., 2] > 0.0
         if self.footprint == 0.0:
             return Candidates(goals, steps, 1 - self.patience * steps, None, on_table)
         path = torch.cat([target_pos.unsqueeze(-2), forecast], dim=-2)
-        before, stay = self.stays(path, goals, min(2, horizon))
+        before, stay = self.stays(path, goals, min(self.first, horizon))
         return Candidates(goals, steps - before, stay - self.patience * steps, stay, on_table)
 
-    def places(self, forecast: Tensor, horizon: int) -> tuple[Tensor, Tensor]:
+    def places(self, forecast: Tensor, target_pos: Tensor, horizon: int) -> tuple[Tensor, Tensor]:
         """Steps ``(K,)`` of the candidates, and where the target is then, ``(*B, K, 3)`` [m, world]."""
-        first = min(2, horizon)
+        first = min(self.first, horizon)
         steps = torch.arange(first, horizon + 1, self.stride, device=forecast.device)
-        return steps, forecast[..., first - 1 :: self.stride, :]
-
-    def _odds(
-        self,
-        forecast: Tensor,
-        goals: Tensor,
-        time: Tensor,
-        *,
-        arrival: Arrival,
-        needed: Tensor,
-        spread: Spread | None,
-    ) -> Tensor:
-        """Probability of meeting the target at each goal (*B, K, 3) in ``time`` (*B, K) control steps: ``(*B, K)``."""
-        steps, places = self.places(forecast, forecast.shape[-2])
-        told, away = None if spread is None else spread.at(steps), (goals - places)[..., :2]
-        return meeting_odds(arrival, needed, time, told, away, half_width=self.footprint)
+        if first > 0:
+            return steps, forecast[..., first - 1 :: self.stride, :]
+        path = torch.cat([target_pos.unsqueeze(-2), forecast], dim=-2)
+        return steps, path[..., :: self.stride, :]
 
     def _needed(self, goals: Tensor, *, eta: Callable[..., Arrival], tool_pos: Tensor | None) -> tuple[Tensor, Arrival]:
         """Control steps (*B, K) to each goal (*B, K, 3), infinitely many where the robot never arrives; the arrival."""

@@ -141,7 +141,7 @@ class MeetingPlanner(DynamicPlanner):
 
         parts = DynamicPlanner.from_pretrained(name, chunk=chunk)
         search = search or CAUTIOUS
-        spread = SpreadNetwork.from_pretrained(PRETRAINED[name][1]) if search.caution > 0.0 else None
+        spread = SpreadNetwork.from_pretrained(PRETRAINED[name][0]) if search.caution > 0.0 else None
         planner = cls(
             parts.static, parts.forecaster, parts.eta, search=search, adaptation=adaptation, spread=spread,
             latency=latency, gone_below=parts.gone_below, chunk=chunk,

@@ -15,6 +15,7 @@ from torch import Tensor
 
 from torchdyn_plan.cli_arguments import CollectArguments
 from torchdyn_plan.envs.episodes import draw_starts
+from torchdyn_plan.envs.fetch import fetch_digest
 from torchdyn_plan.envs.reaching import ReachingTask
 from torchdyn_plan.envs.scene import TrapperScene
 from torchdyn_plan.envs.simulation import TrapperSimulation
@@ -22,7 +23,8 @@ from torchdyn_plan.envs.trapping import is_pocketed
 from torchdyn_plan.errors import InputError
 from torchdyn_plan.files import write_json, write_whole
 from torchdyn_plan.planners import STATIC_PLANNERS, PolicyPlanner, StaticPlanner
-from torchdyn_plan.training.runs import record_runs
+from torchdyn_plan.training.reach_data import record_fetch_runs, record_goal_paths
+from torchdyn_plan.training.runs import record_runs, trapper_runs
 from torchdyn_plan.versions import library_versions
 
 PATH_STEPS = 2000
@@ -45,22 +47,22 @@ def collect(arguments: CollectArguments, planner: StaticPlanner | None = None, *
     """
     from tqdm import tqdm
 
-    scene = TrapperScene()
     torch.set_num_threads(1)
     static = arguments.static if planner is None else name
     driver = planner or _driver(arguments)
+    scene = task_digest(arguments.task)
+    record = RECORDERS[arguments.task, arguments.what]
     shards = -(-arguments.episodes // SHARD[arguments.what])
     for index in tqdm(range(shards), desc=f"collect {arguments.what}", unit="shard"):
         path = arguments.out / f"{arguments.what}-{arguments.seed}-{index:03d}.safetensors"
         made = _made(arguments, scene, index, static)
         if path.exists() and _is_kept(path, made):
             continue
-        paths = arguments.what == "paths"
-        tensors = _paths(arguments, scene, index) if paths else _arrivals(arguments, scene, index, driver)
+        tensors = record(arguments, index, driver)
         write_whole(path, lambda temporary, tensors=tensors, made=made: save_file(tensors, temporary, made))
     fields = {key: str(value) if isinstance(value, Path) else value for key, value in _fields(arguments).items()}
     fields["static"] = static
-    about = {"arguments": fields, "scene": scene.digest(), "versions": library_versions()}
+    about = {"arguments": fields, "scene": scene, "versions": library_versions()}
     write_json(arguments.out / f"{arguments.what}-{arguments.seed}.json", about)
 
 
@@ -72,10 +74,10 @@ def _fields(arguments: CollectArguments) -> dict[str, Any]:
     return dataclasses.asdict(arguments)
 
 
-def _made(arguments: CollectArguments, scene: TrapperScene, index: int, static: str) -> dict[str, str]:
+def _made(arguments: CollectArguments, scene: str, index: int, static: str) -> dict[str, str]:
     """What decides a shard's numbers: its metadata."""
     episodes = sum(map(len, _shard_rows(arguments, index)))
-    shared = {"scene": scene.digest(), "num_envs": str(arguments.num_envs), "episodes": str(episodes)}
+    shared = {"scene": scene, "num_envs": str(arguments.num_envs), "episodes": str(episodes)}
     if arguments.what == "paths":
         return shared
     weights = {} if arguments.weights is None else {"weights": _digest(policy_file(arguments.weights))}
@@ -106,9 +108,9 @@ def _shard_rows(arguments: CollectArguments, index: int) -> Iterator[Tensor]:
         yield torch.arange(first, min(first + arguments.num_envs, last))
 
 
-def _paths(arguments: CollectArguments, scene: TrapperScene, index: int) -> dict[str, Tensor]:
+def _paths(arguments: CollectArguments, index: int, _: StaticPlanner) -> dict[str, Tensor]:
     """Balls rolled alone (the arm at home touches none), each at a velocity of its own up to `FASTEST`."""
-    paths, speeds = [], []
+    scene, paths, speeds = TrapperScene(), [], []
     for episodes in _shard_rows(arguments, index):
         place, velocity = draw_starts(scene, episodes, velocity=1.0, split="train", seed=arguments.seed)
         draw = torch.Generator().manual_seed(arguments.seed * 1_000_003 + int(episodes[0]))
@@ -167,15 +169,41 @@ def _digest(file: Path) -> str:
 def _driver(arguments: CollectArguments) -> StaticPlanner:
     """The static planner that ``arguments`` name."""
     if arguments.weights is None:
-        return STATIC_PLANNERS[arguments.static]()
+        return STATIC_PLANNERS[arguments.task][arguments.static]()
     return PolicyPlanner.from_pretrained(policy_file(arguments.weights))
 
 
-def _arrivals(
-    arguments: CollectArguments, scene: TrapperScene, index: int, planner: StaticPlanner
-) -> dict[str, Tensor]:
+def _arrivals(arguments: CollectArguments, index: int, planner: StaticPlanner) -> dict[str, Tensor]:
     """Runs of the static planner, whole sequences of every arm."""
+    scene = TrapperScene()
     task = ReachingTask(planner, arguments.num_envs, scene=scene, num_threads=arguments.threads)
     draw = torch.Generator().manual_seed(arguments.seed * 1_000_003 + index)
-    parts = [record_runs(task, draw) for _ in _shard_rows(arguments, index)]
+    parts = [record_runs(task, trapper_runs(scene), draw) for _ in _shard_rows(arguments, index)]
     return {name: torch.cat([part[name] for part in parts]) for name in parts[0]}
+
+
+def _goal_paths(arguments: CollectArguments, index: int, _: StaticPlanner) -> dict[str, Tensor]:
+    """Goals of Reach, no gripper near."""
+    return record_goal_paths(torch.cat(list(_shard_rows(arguments, index))), seed=arguments.seed)
+
+
+def _fetch_arrivals(arguments: CollectArguments, index: int, planner: StaticPlanner) -> dict[str, Tensor]:
+    """Runs of the static planner of the Fetch arm."""
+    return record_fetch_runs(
+        planner, arguments.num_envs, len(list(_shard_rows(arguments, index))),
+        seed=arguments.seed * 1_000_003 + index, num_threads=arguments.threads,
+    )  # fmt: skip
+
+
+RECORDERS = {
+    ("trapper", "paths"): _paths,
+    ("trapper", "arrivals"): _arrivals,
+    ("reach", "paths"): _goal_paths,
+    ("reach", "arrivals"): _fetch_arrivals,
+}
+"""What fills a shard, for each task and kind of data."""
+
+
+def task_digest(task: str) -> str:
+    """Hash of the scene that a task's data belongs to."""
+    return TrapperScene().digest() if task == "trapper" else fetch_digest()

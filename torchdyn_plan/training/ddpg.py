@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Iterator
 from dataclasses import dataclass
+from functools import partial
 from typing import Any, Protocol
 
 import torch
@@ -28,8 +29,44 @@ SEEN: list[Any] = [keys.OBSERVATION, keys.DESIRED_GOAL]
 """What a policy reads."""
 
 
+class GoalReplay(Protocol):
+    """A replay buffer of whole episodes, as the training sees it."""
+
+    @property
+    def cursor(self) -> int:
+        """Where the next episode goes."""
+        ...
+
+    def extend_episodes(self, episodes: TensorDictBase) -> None:
+        """Add whole ``episodes``, batch ``(N, length)``."""
+        ...
+
+    def sample(self) -> Any:
+        """A batch of transitions."""
+        ...
+
+    def tensors(self) -> dict[str, Tensor]:
+        """What is stored, by flat names."""
+        ...
+
+    def restore(self, tensors: dict[str, Tensor], cursor: int) -> None:
+        """Fill an empty buffer with what `tensors` gave."""
+        ...
+
+
+def hindsight_replay(task: GoalTask, recipe: DDPGRecipe, device: torch.device) -> HindsightReplayBuffer:
+    """The buffer of hindsight experience replay."""
+    return HindsightReplayBuffer(
+        task.reward, capacity=recipe.capacity, length=task.length, batch_size=recipe.batch, her_ratio=recipe.her_ratio,
+        device=device,
+    )  # fmt: skip
+
+
 class GoalTask(Protocol):
-    """A task of reaching goals, as the training sees it."""
+    """A task of reaching goals, as the training sees it.
+
+    One whose goals need another replay than `hindsight_replay` also has ``make_replay(recipe, device) -> GoalReplay``.
+    """
 
     policy_config: PolicyConfig
     stored: tuple[Any, ...]
@@ -169,10 +206,7 @@ class DDPG:
         for parameters in groups:
             parameters["params"] = [entry for entry in parameters["params"] if isinstance(entry, nn.Parameter)]
         self.optimiser = torch.optim.Adam(groups, fused=True)
-        self.replay = HindsightReplayBuffer(
-            task.reward, capacity=recipe.capacity, length=task.length, batch_size=recipe.batch,
-            her_ratio=recipe.her_ratio, device=self.device,
-        )  # fmt: skip
+        self.replay: GoalReplay = getattr(task, "make_replay", partial(hindsight_replay, task))(recipe, self.device)
         self.env: Any = task.make_env(recipe.num_envs, seed=recipe.seed)
         spec = self.env.action_spec_unbatched
         self.random = RandomActionModule(spec, recipe.random_share)

@@ -9,21 +9,19 @@ import torch
 from torch import Tensor
 from torch.nn.functional import cross_entropy
 
-from torchdyn_plan.envs.scene import TrapperScene
 from torchdyn_plan.errors import InputError
 from torchdyn_plan.nets.eta import ETAConfig, ETANetwork, arrival_classes
 from torchdyn_plan.nets.forecaster import Forecaster, ForecasterConfig
 from torchdyn_plan.training.arrivals import load_arrivals, split_groups
 from torchdyn_plan.training.card import read_description, write_card
 from torchdyn_plan.training.lines import unfold_paths
-from torchdyn_plan.training.metrics import arrival_errors, arrival_groups, forecast_errors, pocket_accuracy
+from torchdyn_plan.training.metrics import arrival_errors, forecast_errors, pocket_accuracy
 from torchdyn_plan.training.optimise import Recipe, optimise
+from torchdyn_plan.training.tasks import FitTask, trapper_task
 from torchdyn_plan.training.windows import Paths, WindowConfig, Windows, draw_windows, last_useful_step, load_paths
 
 SCORED = 4096
 """Held-out windows of each kind, or held-out samples, in one pass of validation."""
-TABLE_GOAL = 0.01
-"""A goal less than this above a ball on the table is on the table [m], as `torchdyn_plan.envs.trapping` has it."""
 
 Tables = dict[str, list[dict[str, Any]]]
 
@@ -39,7 +37,7 @@ def fit_forecaster(
     device: str = "cpu",
     resume: bool = True,
     config: ForecasterConfig | None = None,
-    scene: TrapperScene | None = None,
+    task: FitTask | None = None,
 ) -> Path:
     """Fit a `Forecaster` to the ``paths`` in ``data``; one in ten episodes is held out and scored.
 
@@ -52,8 +50,8 @@ def fit_forecaster(
         seed: of initialisation, held-out episodes and draws.
         device: where to train.
         resume: whether to continue from the checkpoint in ``out``.
-        config: of the network; by default Trapper's, with the symmetries of its table and its cushions.
-        scene: that the data must come from.
+        config: of the network; the task's by default.
+        task: that the data must come from; Trapper by default.
 
     Returns:
         The weights' file.
@@ -63,11 +61,11 @@ def fit_forecaster(
         TrainingError: the loss is NaN, or the checkpoint is damaged or has other settings.
     """
     recipe = Recipe(steps=steps, batch=batch, lr=lr, seed=seed, device=device)
-    scene = scene or TrapperScene()
-    config = config or ForecasterConfig(square_symmetry=True, half_extent=scene.half_side - scene.ball_radius)
-    about = read_description(data, "paths", scene=scene.digest())
+    task = task or trapper_task()
+    config = config or task.forecaster
+    about = read_description(data, "paths", scene=task.digest)
     folder = out / Forecaster.kind
-    drawing = WindowConfig(history=config.history, horizon=config.horizon)
+    drawing = replace(task.windows, history=config.history, horizon=config.horizon)
     paths = load_paths(data)
     last = last_useful_step(paths, drawing)
     usable = (last >= drawing.first_step).nonzero().squeeze(-1)
@@ -85,15 +83,14 @@ def fit_forecaster(
 
     def score() -> Tables:
         forecast = _in_parts(lambda rows: network(windows.history[rows].to(device)), len(windows.history))
-        return {
-            "Errors on held-out windows [m]": forecast_errors(forecast, windows),
-            "Swallowed targets": [pocket_accuracy(forecast, windows)],
-        }
+        errors = forecast_errors(forecast, windows, ahead=task.ahead, fast=task.fast)
+        tables = {"Errors on held-out windows [m]": errors}
+        return tables | ({"Swallowed targets": [pocket_accuracy(forecast, windows)]} if task.pockets else {})
 
     optimise(network, loss, lambda: _forecast_figures(score()), recipe, out=folder, settings=settings, resume=resume)
     facts = {"data": about["arguments"], "scene": about["scene"]}
     facts |= {"episodes": len(paths.length), "held out": len(held), "network": asdict(config)}
-    return _finish(network, folder, score, recipe, facts)
+    return _finish(network, folder, score, recipe=recipe, task=task.name, facts=facts)
 
 
 def held_windows(paths: Paths, last: Tensor, held: Tensor, drawing: WindowConfig, seed: int) -> Windows:
@@ -138,7 +135,7 @@ def fit_eta(
     device: str = "cpu",
     resume: bool = True,
     config: ETAConfig | None = None,
-    scene: TrapperScene | None = None,
+    task: FitTask | None = None,
 ) -> Path:
     """Fit an `ETANetwork` to the ``arrivals`` in ``data``; one in ten runs is held out and scored.
 
@@ -151,8 +148,8 @@ def fit_eta(
         seed: of initialisation, held-out runs and draws.
         device: where to train.
         resume: whether to continue from the checkpoint in ``out``.
-        config: of the network; for a UR5 by default.
-        scene: that the data must come from.
+        config: of the network; the task's by default.
+        task: that the data must come from; Trapper by default.
 
     Returns:
         The weights' file.
@@ -162,8 +159,9 @@ def fit_eta(
         TrainingError: the loss is NaN, or the checkpoint is damaged or has other settings.
     """
     recipe = Recipe(steps=steps, batch=batch, lr=lr, seed=seed, device=device)
-    scene, config = scene or TrapperScene(), config or ETAConfig()
-    about = read_description(data, "arrivals", scene=scene.digest())
+    task = task or trapper_task()
+    config = config or task.eta
+    about = read_description(data, "arrivals", scene=task.digest)
     folder = out / ETANetwork.kind
     samples = load_arrivals(data)
     if samples.robot_state.shape[-1] != config.robot_state_size:
@@ -181,7 +179,7 @@ def fit_eta(
         classes, _ = arrival_classes(arrival, bins=config.bins, bin_width=config.bin_width)
         return cross_entropy(network(state.to(device), goal.to(device)), classes.to(device))
 
-    groups = arrival_groups(held.robot_state, held.goal, held.arrival, table_goal=scene.ball_radius + TABLE_GOAL)
+    groups = task.groups(held)
     settings = {"network": asdict(config), "scene": about["scene"], "samples": len(samples.run)}
 
     def score() -> Tables:
@@ -194,7 +192,7 @@ def fit_eta(
     optimise(network, loss, lambda: _arrival_figures(score()), recipe, out=folder, settings=settings, resume=resume)
     facts = {"data": about["arguments"], "scene": about["scene"]}
     facts |= {"samples": len(samples.run), "held out": len(held.run), "network": asdict(config)}
-    return _finish(network, folder, score, recipe, facts)
+    return _finish(network, folder, score, recipe=recipe, task=task.name, facts=facts)
 
 
 def _some(rows: Tensor, count: int) -> Tensor:
@@ -210,9 +208,10 @@ def _in_parts(forward: Callable[[slice], Tensor], count: int) -> Tensor:
 
 
 def _forecast_figures(tables: Tables) -> dict[str, float]:
-    errors, pockets = tables.values()
+    errors, *pockets = tables.values()
     figures = {f"{row['windows']}_{row['ahead']}": row["median"] for row in errors if row["windows"] != "still"}
-    figures |= {f"pocket_{name}": pockets[0][name] for name in ("found", "false")}
+    for (table,) in pockets:
+        figures |= {f"pocket_{name}": table[name] for name in ("found", "false")}
     return {name: value for name, value in figures.items() if value is not None}
 
 
@@ -230,7 +229,9 @@ def _finish(
     network: Forecaster | ETANetwork,
     folder: Path,
     score: Callable[[], Tables],
+    *,
     recipe: Recipe,
+    task: str,
     facts: Mapping[str, Any],
 ) -> Path:
     """Write weights and card."""
@@ -238,7 +239,10 @@ def _finish(
     with torch.no_grad():
         tables = score()
     file = network.save_pretrained(folder)
-    command = f"torchdyn-plan train {network.kind} --steps {recipe.steps} --batch {recipe.batch} --lr {recipe.lr:g}"
-    facts = {"command": f"`{command} --seed {recipe.seed}`", "recipe": asdict(recipe)} | dict(facts)
-    write_card(file.with_suffix(".md"), f"{type(network).__name__} of Trapper", facts, tables)
+    settings = f"--steps {recipe.steps} --batch {recipe.batch} --lr {recipe.lr:g} --seed {recipe.seed}"
+    facts = {
+        "command": f"`torchdyn-plan train {network.kind} --task {task} {settings}`",
+        "recipe": asdict(recipe),
+    } | dict(facts)
+    write_card(file.with_suffix(".md"), f"{type(network).__name__} of {task.title()}", facts, tables)
     return file

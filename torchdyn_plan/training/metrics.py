@@ -1,6 +1,6 @@
 """How far forecasts and arrival times are off, on windows and runs that no network was fitted to."""
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import torch
@@ -24,7 +24,9 @@ SOON = 30
 """Arrivals within fewer steps than this are scored apart too."""
 
 
-def forecast_errors(forecast: Tensor, windows: Windows) -> list[dict[str, Any]]:
+def forecast_errors(
+    forecast: Tensor, windows: Windows, *, ahead: Sequence[int] = AHEAD, fast: float = FAST
+) -> list[dict[str, Any]]:
     """Distances between forecast and truth, beside those of constant velocity.
 
     Windows whose target moves are told apart: ``full`` and ``padded`` histories of targets that stay on the table,
@@ -34,25 +36,27 @@ def forecast_errors(forecast: Tensor, windows: Windows) -> list[dict[str, Any]]:
     Args:
         forecast: ``(n, F, 3)`` [m, world], on the table (not unfolded).
         windows: of n targets, whose ``future`` is the path itself.
+        ahead: control steps ahead that are scored, but for those beyond the horizon.
+        fast: motion from which a target is fast [m a step].
 
     Returns:
-        A row for each kind of window and each of `AHEAD`: ``windows, ahead, count, median, mean,
+        A row for each kind of window and each of ``ahead``: ``windows, ahead, count, median, mean,
         constant_velocity`` (its median) [m]; errors are None where no window counts.
     """
     now, step = windows.history[:, -1], windows.history[:, -1] - windows.history[:, -2]
     rows = []
-    for kind, chosen in _kinds(windows).items():
-        for ahead in (ahead for ahead in AHEAD if ahead <= forecast.shape[-2]):
-            scored = chosen & windows.recorded[:, ahead - 1]
-            truth = windows.future[scored, ahead - 1]
-            error = (forecast[scored, ahead - 1] - truth).norm(dim=-1)
-            straight = (now[scored] + ahead * step[scored] - truth).norm(dim=-1)
+    for kind, chosen in _kinds(windows, fast).items():
+        for steps in (steps for steps in ahead if steps <= forecast.shape[-2]):
+            scored = chosen & windows.recorded[:, steps - 1]
+            truth = windows.future[scored, steps - 1]
+            error = (forecast[scored, steps - 1] - truth).norm(dim=-1)
+            straight = (now[scored] + steps * step[scored] - truth).norm(dim=-1)
             figures = {"median": _median(error), "mean": _mean(error), "constant_velocity": _median(straight)}
-            rows.append({"windows": kind, "ahead": ahead, "count": int(scored.sum())} | figures)
+            rows.append({"windows": kind, "ahead": steps, "count": int(scored.sum())} | figures)
     return rows
 
 
-def _kinds(windows: Windows) -> dict[str, Tensor]:
+def _kinds(windows: Windows, fast: float = FAST) -> dict[str, Tensor]:
     """Masks ``(n,)`` of the windows that are scored together."""
     padded = windows.history_length < windows.history.shape[-2]
     stays, moving = ~windows.pocketed, windows.moving
@@ -60,7 +64,7 @@ def _kinds(windows: Windows) -> dict[str, Tensor]:
     return {
         "full": moving & stays & ~padded,
         "padded": moving & stays & padded,
-        "fast": moving & stays & (step.norm(dim=-1) >= FAST),
+        "fast": moving & stays & (step.norm(dim=-1) >= fast),
         "pocketed": moving & windows.pocketed,
         "still": ~moving,
     }
@@ -127,21 +131,15 @@ def pocket_accuracy(forecast: Tensor, windows: Windows) -> dict[str, Any]:
     }
 
 
-def arrival_groups(robot_state: Tensor, goal: Tensor, arrival: Tensor, *, table_goal: float) -> dict[str, Tensor]:
-    """Masks ``(n,)`` of the samples that are scored together.
+def arrival_groups(arrival: Tensor, rest: Tensor) -> dict[str, Tensor]:
+    """Masks ``(n,)`` of the samples that are scored together in any task.
 
     Args:
-        robot_state: ``(n, 15)``: joint angles, joint speeds, tool position.
-        goal: ``(n, 3)`` [m, world].
         arrival: ``(n,)`` control steps, negative for never.
-        table_goal: greatest height of a goal on the table [m].
+        rest: ``(n,)`` bool: the robot is at rest.
     """
-    rest = robot_state[:, 6:12].abs().amax(-1) < STILL
-    low = goal[:, 2] <= table_goal
-    everything = torch.ones_like(rest)
     soon = (arrival >= 0) & (arrival < SOON)
-    groups = {"all": everything, "soon": soon, "on table": low, "above table": ~low}
-    return groups | {"at rest": rest, "in motion": ~rest}
+    return {"all": torch.ones_like(rest), "soon": soon, "at rest": rest, "in motion": ~rest}
 
 
 def arrival_errors(

@@ -2,33 +2,78 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Protocol
+
 import torch
 from torch import Tensor
 
-from torchdyn_plan.envs.reaching import ReachingTask
 from torchdyn_plan.envs.scene import TrapperScene
 
 STATES_PER_RUN = 5
 """Intermediate states taken from each run (paper, Section III-B.3)."""
-SEQUENCE_STEPS = 400
-"""Control steps of a sequence of runs, which starts at home."""
-LONGEST = 240
-"""Control steps after which a run that has neither arrived nor come to rest is given up, and teaches nothing."""
-REDIRECTED = 0.35
-"""Share of runs that are given another goal on their way, and teach nothing themselves."""
-REDIRECTED_WITHIN = 90
-"""A run that is redirected is so within this many control steps."""
+
+
+class RunningTask(Protocol):
+    """Arms that a static planner drives to goals, as `torchdyn_plan.envs.reaching.ReachingTask` does."""
+
+    @property
+    def robot_state(self) -> Tensor:
+        """What an ETA network reads, ``(N, S)``."""
+        ...
+
+    def reset(self) -> None:
+        """Put every arm at its start."""
+        ...
+
+    def is_reached(self, goal: Tensor) -> Tensor:
+        """Whether each arm is at ``goal`` (N, 3) [m, world]: ``(N,)`` bool."""
+        ...
+
+    def step(self, goal: Tensor) -> None:
+        """One control step of every arm towards ``goal`` (N, 3) [m, world]."""
+        ...
+
+
+@dataclass(frozen=True, kw_only=True)
+class RunPlan:
+    """How runs follow one another; times are control steps. By default as for Trapper."""
+
+    goals: Callable[[int, torch.Generator], Tensor]
+    """Draws so many goals, ``(count, 3)`` [m, world]."""
+    at_rest: Callable[[Tensor], Tensor]
+    """Which robot states (N, S) are at rest, ``(N,)``: an arm that comes to rest elsewhere never arrives."""
+    sequence: int = 400
+    """Length of a sequence of runs, which begins at the start."""
+    longest: int = 240
+    """A run that has neither arrived nor come to rest by then is given up, and teaches nothing."""
+    redirected: float = 0.35
+    """Share of runs that are given another goal on their way, and teach nothing themselves."""
+    redirected_within: int = 90
+    """A run that is redirected is so by then."""
+    starting: int = 15
+    """By then a new goal has set an arm in motion."""
+
+
+def trapper_runs(scene: TrapperScene) -> RunPlan:
+    """Goals of `draw_goals`; a UR5 whose joints are slower than `AT_REST` is at rest."""
+    return RunPlan(
+        goals=lambda count, draw: draw_goals(scene, count, draw),
+        at_rest=lambda state: (state[:, 6:12].abs() < AT_REST).all(-1),
+    )
+
+
 AT_REST = 0.05
-"""Joint speeds below this are rest [rad/s]: an arm that comes to rest elsewhere never arrives."""
-STARTING = 15
-"""Control steps within which a new goal sets an arm in motion."""
+"""Joint speeds below this are rest [rad/s]."""
 
 
-def record_runs(task: ReachingTask, draw: torch.Generator) -> dict[str, Tensor]:
+def record_runs(task: RunningTask, plan: RunPlan, draw: torch.Generator) -> dict[str, Tensor]:
     """One sequence of runs of every arm: a new goal when it arrives, comes to rest elsewhere, or is redirected.
 
     Args:
         task: arms driven by the static planner.
+        plan: goals, and how runs follow one another.
         draw: source of goals, redirections and sampled states.
 
     Returns:
@@ -36,17 +81,17 @@ def record_runs(task: ReachingTask, draw: torch.Generator) -> dict[str, Tensor]:
         [m, world], ``arrival`` (n,) control steps from the state to the goal or -1 for never, ``run`` (n,) numbers.
     """
     task.reset()
-    count = task.simulation.num_envs
-    states = torch.empty(SEQUENCE_STEPS + 1, count, task.robot_state.shape[-1])
-    goal, given = draw_goals(task.scene, count, draw), torch.zeros(count, dtype=torch.int64)
-    turning = _turning(count, draw)
+    count, size = task.robot_state.shape
+    states = torch.empty(plan.sequence + 1, count, size)
+    goal, given = plan.goals(count, draw), torch.zeros(count, dtype=torch.int64)
+    turning = _turning(plan, count, draw)
     samples: list[dict[str, Tensor]] = []
-    for step in range(SEQUENCE_STEPS + 1):
+    for step in range(plan.sequence + 1):
         states[step] = task.robot_state
         age = step - given
         arrived = task.is_reached(goal)
-        still = (states[step, :, 6:12].abs() < AT_REST).all(-1) & (age > STARTING)
-        ended = arrived | still | (age >= turning) | (age >= LONGEST)
+        still = plan.at_rest(states[step]) & (age > plan.starting)
+        ended = arrived | still | (age >= turning) | (age >= plan.longest)
         rows = ended.nonzero().squeeze(-1)
         if len(rows):
             teaches = rows[(arrived | still)[rows]]
@@ -58,8 +103,8 @@ def record_runs(task: ReachingTask, draw: torch.Generator) -> dict[str, Tensor]:
                     "arrival": torch.where(arrived[teaches].unsqueeze(-1), step - taken, -1).flatten(),
                 }
             )
-            goal[rows], given[rows] = draw_goals(task.scene, len(rows), draw), step
-            turning[rows] = _turning(len(rows), draw)
+            goal[rows], given[rows] = plan.goals(len(rows), draw), step
+            turning[rows] = _turning(plan, len(rows), draw)
         # A goal's tensor belongs to the planner's memory from here on.
         task.step(goal.clone())
     whole = {name: torch.cat([sample[name] for sample in samples]) for name in samples[0]}
@@ -67,10 +112,10 @@ def record_runs(task: ReachingTask, draw: torch.Generator) -> dict[str, Tensor]:
     return whole
 
 
-def _turning(count: int, draw: torch.Generator) -> Tensor:
-    """Age at which each run is redirected, (count,); `LONGEST` for those that are not."""
+def _turning(plan: RunPlan, count: int, draw: torch.Generator) -> Tensor:
+    """Age at which each run is redirected, (count,); the longest age for those that are not."""
     chance, when = torch.rand(2, count, generator=draw)
-    return torch.where(chance < REDIRECTED, 1 + (when * REDIRECTED_WITHIN).long(), LONGEST)
+    return torch.where(chance < plan.redirected, 1 + (when * plan.redirected_within).long(), plan.longest)
 
 
 def _within(length: Tensor, draw: torch.Generator) -> Tensor:

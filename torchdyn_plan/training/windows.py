@@ -64,8 +64,9 @@ class WindowConfig:
     """Motion below which a target counts as still [m a step]."""
 
     def __post_init__(self) -> None:
-        for name in ("history", "horizon", "first_step", "windows_per_episode"):
+        for name in ("history", "horizon", "windows_per_episode"):
             check_number(name, getattr(self, name), minimum=1, integer=True)
+        check_number("first_step", self.first_step, minimum=0, integer=True)
         for name in ("early_share", "shortened_share"):
             check_number(name, getattr(self, name), minimum=0.0, maximum=1.0)
         check_number("still_speed", self.still_speed, minimum=0.0)

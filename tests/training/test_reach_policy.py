@@ -1,0 +1,34 @@
+import dataclasses
+
+import pytest
+import torch
+
+from torchdyn_plan.envs.reach import reach_reward
+from torchdyn_plan.training.ddpg import DDPG
+from torchdyn_plan.training.dher import DynamicHindsightReplayBuffer
+from torchdyn_plan.training.hindsight import HindsightReplayBuffer
+from torchdyn_plan.training.reach_policy import DHER, ReachTask
+
+SHORT = dataclasses.replace(DHER, iterations=2, num_envs=4, updates=2, batch=32, warmup=1, capacity=1000)
+
+
+@pytest.mark.parametrize(("velocity", "kind"), [(0.02, DynamicHindsightReplayBuffer), (None, HindsightReplayBuffer)])
+def test_it_learns_with_the_replay_that_its_goals_need(velocity, kind):
+    ddpg = DDPG(ReachTask(velocity=velocity, num_threads=1), SHORT)
+    assert isinstance(ddpg.replay, kind)
+    before = [value.clone() for value in ddpg.actor.body.parameters()]
+    ddpg.iterate()
+    figures = ddpg.iterate()
+    assert figures["loss_critic"] > 0.0
+    assert any(not torch.equal(old, new) for old, new in zip(before, ddpg.actor.body.parameters(), strict=True))
+    batch = ddpg.replay.sample()
+    expected = reach_reward(batch["next", "achieved_goal"], batch["next", "desired_goal"])
+    assert torch.equal(batch["next", "reward"], expected)
+
+
+def test_the_recipe_is_its_authors():
+    """250,000 steps, 100,000 updates, and a penalty of 1 on the squared action beside returns in whole steps."""
+    assert DHER.iterations * DHER.num_envs * 50 == 250_000
+    assert DHER.iterations * DHER.updates == 100_000
+    assert DHER.action_penalty / (1.0 - DHER.gamma) == pytest.approx(1.0)
+    assert DHER.tau == pytest.approx(1.0 - 0.95)
