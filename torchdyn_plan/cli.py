@@ -58,11 +58,11 @@ def train(arguments: TrainArguments) -> None:
     from torchdyn_plan.training import fit, spread
     from torchdyn_plan.training.tasks import FIT_TASKS
 
-    if arguments.what == "spread":
-        spread.fit_spread(arguments.data, arguments.out, **arguments.settings())
-        return
-    fits: dict[str, Callable[..., object]] = {"forecaster": fit.fit_forecaster, "eta": fit.fit_eta}
-    fits[arguments.what](arguments.data, arguments.out, task=FIT_TASKS[arguments.task](), **arguments.settings())
+    fits: dict[str, Callable[..., object]] = {
+        "forecaster": fit.fit_forecaster, "eta": fit.fit_eta, "spread": spread.fit_spread,
+    }  # fmt: skip
+    tasks = {} if arguments.what == "spread" else {"task": FIT_TASKS[arguments.task]()}
+    fits[arguments.what](arguments.data, arguments.out, **tasks, **arguments.settings())
 
 
 def _train_policy(arguments: TrainArguments) -> None:

@@ -112,8 +112,8 @@ class EvaluateArguments:
     task: str = "trapper"
     """What the arm has to do: trapper or reach."""
     planners: tuple[str, ...] = PLANNERS
-    """Planners for the moving target: pursuit, wait, corner, oracle, exact, meet; Reach has no wait and no meet, and the
-    rival dher."""
+    """Planners for the moving target: pursuit, wait, corner, oracle, exact, meet; Reach has neither wait nor meet, but
+    the rival dher."""
     static: str = ""
     """Static planner that drives the arm: ik or rl (a learned policy) in Trapper, proportional or rl in Reach. The
     first of the task's when not given."""
@@ -178,8 +178,8 @@ class SweepArguments:
     task: str = "trapper"
     """What the arm has to do: trapper, or reach, whose velocity alone varies."""
     planners: tuple[str, ...] = PLANNERS
-    """Planners for the moving target: pursuit, wait, corner, oracle, exact, meet; Reach has no wait and no meet, and the
-    rival dher."""
+    """Planners for the moving target: pursuit, wait, corner, oracle, exact, meet; Reach has neither wait nor meet, but
+    the rival dher."""
     static: str = ""
     """Static planner that drives the arm: ik or rl (a learned policy) in Trapper, proportional or rl in Reach. The
     first of the task's when not given."""

@@ -163,9 +163,8 @@ def test_a_trapped_ball_was_covered_and_kept():
         pose = arm(end["joint_pos"])
         covered = is_covered(SCENE, end["tool_pos"], pose[:, :3, :3], end["target_pos"])
         assert end["trapped"][:-1].logical_not().all()
-        left = env.max_steps - len(end["reward"]) + 1 if end["trapped"][-1] else 0
-        assert end["reward"][-1] >= left - 4.0
         assert (end["reward"][:-1] < 2.0).all()
+        assert not end["trapped"][-1] or end["reward"][-1] > 20.0, "what it would have earned by staying is missing"
         assert torch.equal(end["terminated"], end["trapped"] | end["pocketed"])
         if bool(end["trapped"][-1]):
             trapped += 1

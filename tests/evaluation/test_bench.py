@@ -100,8 +100,8 @@ def test_more_rows_than_a_block_are_worked_on_block_by_block():
 
 def test_the_planner_step_that_plans_plans_and_the_other_does_not(planner, monkeypatch):
     calls = []
-    plan = DynamicPlanner.plan
-    monkeypatch.setattr(DynamicPlanner, "plan", lambda self, *seen: (calls.append(0), plan(self, *seen))[1])
+    plan = DynamicPlanner.plan_ahead
+    monkeypatch.setattr(DynamicPlanner, "plan_ahead", lambda self, *seen: (calls.append(0), plan(self, *seen))[1])
     seen = bench_replan.observations(3)
     seen.set("plan", planner(seen.copy())["plan"])
     parts = steps(planner)

@@ -45,7 +45,7 @@ def test_evaluate_delays_the_planners_that_it_runs(monkeypatch):
     still = CallablePlanner(lambda state, goal: torch.zeros(*goal.shape[:-1], 6))
     planner = untrained()
     planner.static = still
-    monkeypatch.setitem(run.PLANNERS, "corner", lambda static: planner)
+    monkeypatch.setitem(run.PLANNERS, "corner", lambda static, task: planner)
     monkeypatch.setattr(run, "record_truth", lambda arguments: (torch.zeros(1, 9, 3), torch.ones(1, dtype=torch.bool)))
     monkeypatch.setattr(run, "run_episodes", lambda planner, *others: (planner.latency, planner.delivery.steps))
     for compensate in (True, False):

@@ -87,7 +87,7 @@ def test_the_oracle_by_name_sees_the_truth_in_place_of_a_forecast(shipped, due):
 
 @pytest.mark.parametrize("kind", [DynamicPlanner, OracleTrajectory])
 def test_missing_weights_and_names_are_told(shipped, kind):
-    with pytest.raises(InputError, match=r"unknown planner 'trapper-kuka'.*choose from trapper-ik"):
+    with pytest.raises(InputError, match=r"unknown planner 'trapper-kuka'.*trapper-ik"):
         kind.from_pretrained("trapper-kuka")
     file = shipped[0] / "eta-trapper-ik.safetensors"
     file.write_bytes(file.read_bytes()[:100])

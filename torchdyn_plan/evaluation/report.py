@@ -13,6 +13,8 @@ def format_table(rows: Sequence[ResultRow]) -> str:
     others = [name for row in rows for name in row.failures]
     # Results of old know other causes.
     causes = [name for name in dict.fromkeys((*CAUSES, *others)) if name in others]
+    if reach:
+        causes = [name for name in causes if any(row.failures.get(name) for row in rows)]
     columns: list[tuple[str, Callable[[ResultRow], str]]] = [
         ("planner", lambda row: row.planner),
         *((name, lambda row, name=name: _plain(getattr(row, name))) for name in varying),
