@@ -24,7 +24,8 @@ from torchdyn_plan import keys
 from torchdyn_plan.envs.gym_goals import TrapperGymEnv
 from torchdyn_plan.files import write_json
 from torchdyn_plan.nets.policy import GoalFeatures, PolicyConfig
-from torchdyn_plan.training.ddpg import DDPG, DDPGRecipe
+from torchdyn_plan.training.ddpg import DDPG
+from torchdyn_plan.training.goal_task import DDPGRecipe
 from torchdyn_plan.training.trapper_task import TrapperTask
 from torchdyn_plan.versions import library_versions, machine
 

@@ -5,7 +5,7 @@ import torch
 
 from tests.training.points import PointTask
 from torchdyn_plan.errors import InputError
-from torchdyn_plan.training.ddpg import DDPGRecipe
+from torchdyn_plan.training.goal_task import DDPGRecipe
 
 pytest.importorskip("ray")
 from torchdyn_plan.training.cluster import ClusterDDPG

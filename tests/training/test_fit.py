@@ -33,7 +33,13 @@ def test_forecaster_learns_and_leaves_weights_curve_and_card(data, tmp_path):
     assert curve[-1]["loss"] < curve[0]["loss"]
     assert {"full_25", "padded_300", "pocket_false"} <= curve[-1].keys()
     card = file.with_suffix(".md").read_text()
-    for text in ("train forecaster --task trapper --steps 30", TrapperScene().digest(), "episodes: 12", "torch", "| full | 300 |"):
+    for text in (
+        "train forecaster --task trapper --steps 30",
+        TrapperScene().digest(),
+        "episodes: 12",
+        "torch",
+        "| full | 300 |",
+    ):
         assert text in card
 
 
@@ -46,7 +52,12 @@ def test_eta_learns_and_leaves_weights_curve_and_card(data, tmp_path):
     assert never.tolist() == [False, True]
     assert {"mode_all_mean", "expectation_all_p95"} <= json.loads((file.parent / "curve.json").read_text())[-1].keys()
     card = file.with_suffix(".md").read_text()
-    for text in ("train eta --task trapper --steps 300", TrapperScene().digest(), "samples: 200", "| at rest | expectation |"):
+    for text in (
+        "train eta --task trapper --steps 300",
+        TrapperScene().digest(),
+        "samples: 200",
+        "| at rest | expectation |",
+    ):
         assert text in card
 
 

@@ -14,7 +14,8 @@ import torch
 from tests.training.points import PointTask
 from torchdyn_plan.errors import InputError, TrainingError
 from torchdyn_plan.nets.policy import Actor
-from torchdyn_plan.training.ddpg import DDPG, DDPGRecipe
+from torchdyn_plan.training.ddpg import DDPG
+from torchdyn_plan.training.goal_task import DDPGRecipe
 from torchdyn_plan.training.policy import fit_policy
 
 RECIPE = DDPGRecipe(iterations=12, num_envs=8, updates=20, batch=64, capacity=500, warmup=2, gamma=0.9)

@@ -12,7 +12,8 @@ from torchrl.collectors.distributed import RayCollector
 from torchrl.envs import EnvBase
 
 from torchdyn_plan.errors import InputError
-from torchdyn_plan.training.ddpg import DDPG, DDPGRecipe, GoalTask
+from torchdyn_plan.training.ddpg import DDPG
+from torchdyn_plan.training.goal_task import DDPGRecipe, GoalTask
 
 
 class ClusterDDPG(DDPG):

@@ -4,183 +4,24 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator
-from dataclasses import dataclass
 from functools import partial
-from typing import Any, Protocol
+from typing import Any
 
 import torch
 from tensordict import TensorDictBase
 from tensordict.nn import TensorDictModule, TensorDictModuleBase, TensorDictSequential
 from torch import Tensor, nn
 from torchrl.collectors import BaseCollector, Collector
-from torchrl.envs import EnvBase
 from torchrl.modules import AdditiveGaussianModule, ValueOperator
-from torchrl.objectives import DDPGLoss, SoftUpdate
+from torchrl.objectives import SoftUpdate
 
 from torchdyn_plan import keys
-from torchdyn_plan.checks import check_number
 from torchdyn_plan.errors import TrainingError
-from torchdyn_plan.nets.policy import Actor, Critic, PolicyConfig
+from torchdyn_plan.nets.policy import Actor, Critic
 from torchdyn_plan.training.checkpoint import group
-from torchdyn_plan.training.hindsight import HindsightReplayBuffer
+from torchdyn_plan.training.exploration import PenalisedDDPGLoss, RandomActionModule
+from torchdyn_plan.training.goal_task import SEEN, DDPGRecipe, GoalReplay, GoalTask, hindsight_replay
 from torchdyn_plan.training.optimise import check_device
-
-SEEN: list[Any] = [keys.OBSERVATION, keys.DESIRED_GOAL]
-"""What a policy reads."""
-
-
-class GoalReplay(Protocol):
-    """A replay buffer of whole episodes, as the training sees it."""
-
-    @property
-    def cursor(self) -> int:
-        """Where the next episode goes."""
-        ...
-
-    def extend_episodes(self, episodes: TensorDictBase) -> None:
-        """Add whole ``episodes``, batch ``(N, length)``."""
-        ...
-
-    def sample(self) -> Any:
-        """A batch of transitions."""
-        ...
-
-    def tensors(self) -> dict[str, Tensor]:
-        """What is stored, by flat names."""
-        ...
-
-    def restore(self, tensors: dict[str, Tensor], cursor: int) -> None:
-        """Fill an empty buffer with what `tensors` gave."""
-        ...
-
-
-def hindsight_replay(task: GoalTask, recipe: DDPGRecipe, device: torch.device) -> HindsightReplayBuffer:
-    """The buffer of hindsight experience replay."""
-    return HindsightReplayBuffer(
-        task.reward, capacity=recipe.capacity, length=task.length, batch_size=recipe.batch, her_ratio=recipe.her_ratio,
-        device=device,
-    )  # fmt: skip
-
-
-class GoalTask(Protocol):
-    """A task of reaching goals, as the training sees it.
-
-    One whose goals need another replay than `hindsight_replay` also has ``make_replay(recipe, device) -> GoalReplay``.
-    """
-
-    policy_config: PolicyConfig
-    stored: tuple[Any, ...]
-    """Keys of a transition that `reward` reads, beside those that every learner needs."""
-    length: int
-    """Actions in an episode; all episodes have as many."""
-
-    def make_env(self, num_envs: int, *, seed: int) -> EnvBase:
-        """A batch of environments whose episodes all end after ``length`` actions."""
-        ...
-
-    def reward(self, transitions: TensorDictBase) -> Tensor:
-        """Rewards ``(B, 1)`` of transitions for the ``desired_goal`` that they have."""
-        ...
-
-    def score(self, actor: Actor) -> dict[str, float]:
-        """How well ``actor`` does without exploration; ``success`` is one of the figures."""
-        ...
-
-    def settings(self) -> dict[str, Any]:
-        """What must be the same when a training is continued: JSON values."""
-        ...
-
-
-@dataclass(frozen=True, kw_only=True)
-class DDPGRecipe:
-    """How a policy is trained."""
-
-    iterations: int = 400
-    """Rounds of collection and updates."""
-    num_envs: int = 32
-    """Episodes that run side by side: one round collects a whole episode of each."""
-    updates: int = 100
-    """Optimiser steps a round."""
-    batch: int = 256
-    """Transitions an update."""
-    capacity: int = 500_000
-    """Transitions in the replay buffer."""
-    her_ratio: float = 0.8
-    """Share of a batch whose goals are replaced by achieved ones."""
-    warmup: int = 4
-    """First rounds, of random actions, from which inputs are standardised."""
-    lr_actor: float = 5e-4
-    """Learning rate of the actor."""
-    lr_critic: float = 1e-3
-    """Learning rate of the critic."""
-    final_rate: float = 0.1
-    """Share of the learning rates that is left at the end; they fall along a cosine."""
-    gamma: float = 0.97
-    """Discount of an action."""
-    tau: float = 0.01
-    """Share of the networks that their targets take over at each update."""
-    noise: float = 0.2
-    """Deviation of the noise on actions."""
-    random_share: float = 0.1
-    """Share of actions drawn at random."""
-    action_penalty: float = 0.03
-    """Weight of the mean squared action in the actor's loss, times the greatest value."""
-    clip: float = 10.0
-    """Greatest norm of a gradient."""
-    seed: int = 0
-    """Of initialisation, episodes and every draw."""
-
-    def __post_init__(self) -> None:
-        for name in ("iterations", "num_envs", "updates", "batch", "capacity"):
-            check_number(name, getattr(self, name), minimum=1, integer=True)
-        for name in ("seed", "warmup"):
-            check_number(name, getattr(self, name), minimum=0, integer=True)
-        for name in ("lr_actor", "lr_critic", "clip"):
-            check_number(name, getattr(self, name), minimum=1e-12)
-        for name in ("her_ratio", "gamma", "tau", "random_share", "final_rate"):
-            check_number(name, getattr(self, name), minimum=0.0, maximum=1.0)
-        for name in ("noise", "action_penalty"):
-            check_number(name, getattr(self, name), minimum=0.0)
-
-    def rate(self, iteration: int) -> float:
-        """Factor of the learning rates in ``iteration`` (0 … iterations-1)."""
-        cosine = 0.5 * (1.0 + math.cos(math.pi * iteration / self.iterations))
-        return self.final_rate + (1.0 - self.final_rate) * cosine
-
-
-class RandomActionModule(TensorDictModuleBase):
-    """Replaces a share of the actions by random ones, as hindsight replay's authors do (Andrychowicz et al., 2017)."""
-
-    def __init__(self, spec: Any, share: float) -> None:
-        """Draw from ``spec``, of one environment, with probability ``share`` a row."""
-        super().__init__()
-        self.spec, self.share = spec, share
-        self.in_keys = self.out_keys = [keys.ACTION]
-
-    def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
-        """Change ``action`` in some rows."""
-        action = tensordict.get(keys.ACTION)
-        chosen = torch.rand(action.shape[:-1]).to(action.device) < self.share
-        drawn = self.spec.rand(action.shape[:-1]).to(action.device)
-        tensordict.set(keys.ACTION, torch.where(chosen.unsqueeze(-1), drawn, action))
-        return tensordict
-
-
-class PenalisedDDPGLoss(DDPGLoss):
-    """TorchRL's loss, plus a weight times the mean squared action of the actor."""
-
-    action_penalty: float = 0.0
-
-    def loss_actor(self, tensordict: TensorDictBase) -> Any:
-        """TorchRL's, but for the penalty."""
-        seen = tensordict.select(*self.actor_in_keys, *self.value_exclusive_keys, strict=False).detach()
-        with self.actor_network_params.to_module(self.actor_network, preserve_module_state=False):
-            acted = self.actor_network(seen)
-        effort = acted.get(keys.ACTION).square().mean()
-        with self._cached_detached_value_params.to_module(self.value_network, preserve_module_state=False):
-            acted = self.value_network(acted)
-        value = acted.get(self.tensor_keys.state_action_value).mean()
-        return self.action_penalty * effort - value, {}
 
 
 class DDPG:

@@ -20,7 +20,8 @@ from torchdyn_plan.files import write_whole
 from torchdyn_plan.nets.policy import Actor
 from torchdyn_plan.training.card import write_card
 from torchdyn_plan.training.checkpoint import group, read_checkpoint, write_checkpoint
-from torchdyn_plan.training.ddpg import DDPG, DDPGRecipe, GoalTask
+from torchdyn_plan.training.ddpg import DDPG
+from torchdyn_plan.training.goal_task import DDPGRecipe, GoalTask
 
 
 def train_trapper(arguments: TrainArguments) -> Path:

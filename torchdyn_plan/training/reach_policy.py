@@ -18,8 +18,8 @@ from torchdyn_plan.evaluation.reach import run_episodes
 from torchdyn_plan.nets.policy import Actor, PolicyConfig
 from torchdyn_plan.planners.baselines import TargetPursuit
 from torchdyn_plan.planners.policy import PolicyPlanner
-from torchdyn_plan.training.ddpg import DDPGRecipe, GoalReplay, hindsight_replay
 from torchdyn_plan.training.dher import DynamicHindsightReplayBuffer
+from torchdyn_plan.training.goal_task import DDPGRecipe, GoalReplay, hindsight_replay
 from torchdyn_plan.training.policy import fit_policy
 
 DHER = DDPGRecipe(

@@ -1,0 +1,139 @@
+"""What a training of a policy is given: a task of reaching goals, and how to go about it."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import Any, Protocol
+
+import torch
+from tensordict import TensorDictBase
+from torch import Tensor
+from torchrl.envs import EnvBase
+
+from torchdyn_plan import keys
+from torchdyn_plan.checks import check_number
+from torchdyn_plan.nets.policy import Actor, PolicyConfig
+from torchdyn_plan.training.hindsight import HindsightReplayBuffer
+
+SEEN: list[Any] = [keys.OBSERVATION, keys.DESIRED_GOAL]
+"""What a policy reads."""
+
+
+class GoalReplay(Protocol):
+    """A replay buffer of whole episodes, as the training sees it."""
+
+    @property
+    def cursor(self) -> int:
+        """Where the next episode goes."""
+        ...
+
+    def extend_episodes(self, episodes: TensorDictBase) -> None:
+        """Add whole ``episodes``, batch ``(N, length)``."""
+        ...
+
+    def sample(self) -> Any:
+        """A batch of transitions."""
+        ...
+
+    def tensors(self) -> dict[str, Tensor]:
+        """What is stored, by flat names."""
+        ...
+
+    def restore(self, tensors: dict[str, Tensor], cursor: int) -> None:
+        """Fill an empty buffer with what `tensors` gave."""
+        ...
+
+
+def hindsight_replay(task: GoalTask, recipe: DDPGRecipe, device: torch.device) -> HindsightReplayBuffer:
+    """The buffer of hindsight experience replay."""
+    return HindsightReplayBuffer(
+        task.reward, capacity=recipe.capacity, length=task.length, batch_size=recipe.batch, her_ratio=recipe.her_ratio,
+        device=device,
+    )  # fmt: skip
+
+
+class GoalTask(Protocol):
+    """A task of reaching goals, as the training sees it.
+
+    One whose goals need another replay than `hindsight_replay` also has ``make_replay(recipe, device) -> GoalReplay``.
+    """
+
+    policy_config: PolicyConfig
+    stored: tuple[Any, ...]
+    """Keys of a transition that `reward` reads, beside those that every learner needs."""
+    length: int
+    """Actions in an episode; all episodes have as many."""
+
+    def make_env(self, num_envs: int, *, seed: int) -> EnvBase:
+        """A batch of environments whose episodes all end after ``length`` actions."""
+        ...
+
+    def reward(self, transitions: TensorDictBase) -> Tensor:
+        """Rewards ``(B, 1)`` of transitions for the ``desired_goal`` that they have."""
+        ...
+
+    def score(self, actor: Actor) -> dict[str, float]:
+        """How well ``actor`` does without exploration; ``success`` is one of the figures."""
+        ...
+
+    def settings(self) -> dict[str, Any]:
+        """What must be the same when a training is continued: JSON values."""
+        ...
+
+
+@dataclass(frozen=True, kw_only=True)
+class DDPGRecipe:
+    """How a policy is trained."""
+
+    iterations: int = 400
+    """Rounds of collection and updates."""
+    num_envs: int = 32
+    """Episodes that run side by side: one round collects a whole episode of each."""
+    updates: int = 100
+    """Optimiser steps a round."""
+    batch: int = 256
+    """Transitions an update."""
+    capacity: int = 500_000
+    """Transitions in the replay buffer."""
+    her_ratio: float = 0.8
+    """Share of a batch whose goals are replaced by achieved ones."""
+    warmup: int = 4
+    """First rounds, of random actions, from which inputs are standardised."""
+    lr_actor: float = 5e-4
+    """Learning rate of the actor."""
+    lr_critic: float = 1e-3
+    """Learning rate of the critic."""
+    final_rate: float = 0.1
+    """Share of the learning rates that is left at the end; they fall along a cosine."""
+    gamma: float = 0.97
+    """Discount of an action."""
+    tau: float = 0.01
+    """Share of the networks that their targets take over at each update."""
+    noise: float = 0.2
+    """Deviation of the noise on actions."""
+    random_share: float = 0.1
+    """Share of actions drawn at random."""
+    action_penalty: float = 0.03
+    """Weight of the mean squared action in the actor's loss, times the greatest value."""
+    clip: float = 10.0
+    """Greatest norm of a gradient."""
+    seed: int = 0
+    """Of initialisation, episodes and every draw."""
+
+    def __post_init__(self) -> None:
+        for name in ("iterations", "num_envs", "updates", "batch", "capacity"):
+            check_number(name, getattr(self, name), minimum=1, integer=True)
+        for name in ("seed", "warmup"):
+            check_number(name, getattr(self, name), minimum=0, integer=True)
+        for name in ("lr_actor", "lr_critic", "clip"):
+            check_number(name, getattr(self, name), minimum=1e-12)
+        for name in ("her_ratio", "gamma", "tau", "random_share", "final_rate"):
+            check_number(name, getattr(self, name), minimum=0.0, maximum=1.0)
+        for name in ("noise", "action_penalty"):
+            check_number(name, getattr(self, name), minimum=0.0)
+
+    def rate(self, iteration: int) -> float:
+        """Factor of the learning rates in ``iteration`` (0 … iterations-1)."""
+        cosine = 0.5 * (1.0 + math.cos(math.pi * iteration / self.iterations))
+        return self.final_rate + (1.0 - self.final_rate) * cosine
