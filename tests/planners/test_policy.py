@@ -9,6 +9,7 @@ from torchdyn_plan import keys
 from torchdyn_plan.errors import InputError
 from torchdyn_plan.nets import Actor
 from torchdyn_plan.planners import PolicyPlanner
+from torchdyn_plan.planners.approach import Approach
 
 
 class Counting(nn.Module):
@@ -82,3 +83,23 @@ def test_says_what_is_missing() -> None:
         PolicyPlanner(Actor())(seen(0).exclude(keys.GOAL))
     with pytest.raises(InputError, match="period"):
         PolicyPlanner(Actor(), period=0)
+
+
+def test_goals_beyond_the_arm_are_brought_to_the_edge_of_its_reach() -> None:
+    seen_goals = []
+    approach = Approach()
+
+    class Spy(Counting):
+        def forward(self, state: torch.Tensor, goal: torch.Tensor) -> torch.Tensor:
+            seen_goals.append(goal)
+            return super().forward(state, goal)
+
+    tensordict = seen(0, rows=3)
+    tensordict[keys.GOAL] = torch.tensor([[0.1, -0.3, 0.042], [0.2, 0.7, 0.105], [0.75, -0.8, 0.042]])
+    PolicyPlanner(Spy(), approach=approach)(tensordict)
+    (goal,) = seen_goals
+    torch.testing.assert_close(goal[0], tensordict[keys.GOAL][0])
+    base = torch.tensor(approach.base_pos[:2])
+    assert float((goal[1, :2] - base).norm()) == pytest.approx(approach.max_radius, abs=1e-5)
+    assert torch.equal(goal[:, 2], tensordict[keys.GOAL][:, 2])
+    assert goal[:, :2].abs().max() <= approach.half_extent + 1e-6

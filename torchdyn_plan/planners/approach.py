@@ -66,6 +66,13 @@ def tool_target(goal: Sequence[Tensor], approach: Approach) -> tuple[Tensor, Ten
     return x, y, torch.where(on_table, approach.down_height, height), on_table
 
 
+def within_reach(goal: Tensor, approach: Approach) -> Tensor:
+    """``goal`` (*B, 3) [m, world], or the nearest place to it where the tool can be, at the same height."""
+    x, y, _, _ = tool_target(goal.unbind(-1), approach)
+    base_x, base_y, _ = approach.base_pos
+    return torch.stack([x + base_x, y + base_y, goal[..., 2]], dim=-1)
+
+
 def way_to(
     tool: Sequence[Tensor], target: Sequence[Tensor], on_table: Tensor, approach: Approach
 ) -> tuple[Tensor, Tensor, Tensor]:

@@ -13,6 +13,7 @@ from torch import Tensor, nn
 from torchdyn_plan import keys
 from torchdyn_plan.checks import check_number
 from torchdyn_plan.nets.policy import Actor
+from torchdyn_plan.planners.approach import Approach, within_reach
 from torchdyn_plan.planners.protocol import read
 from torchdyn_plan.planners.rows import apply_to_rows
 
@@ -26,12 +27,19 @@ class PolicyPlanner(TensorDictModuleBase):
     remember for that it keeps in the tensordict under ``plan``.
     """
 
-    def __init__(self, actor: nn.Module, *, period: int = 1, chunk: int | None = None) -> None:
+    restless = True
+    """Whether it goes on moving where it cannot get nearer to its goal."""
+
+    def __init__(
+        self, actor: nn.Module, *, period: int = 1, approach: Approach | None = None, chunk: int | None = None
+    ) -> None:
         """Act by ``actor``.
 
         Args:
             actor: maps robot states ``(*B, S)`` and goals ``(*B, 3)`` [m, world] to actions ``(*B, A)``.
             period: control steps for which an action holds.
+            approach: how far the tool reaches: a goal beyond, which the actor never saw, is brought to the edge. None
+                to leave goals as they are.
             chunk: act in blocks of exactly this many rows, so that results do not depend on the batch size.
         """
         super().__init__()
@@ -39,7 +47,7 @@ class PolicyPlanner(TensorDictModuleBase):
         if chunk is not None:
             check_number("chunk", chunk, minimum=1, integer=True)
         act: Any = actor
-        self.actor, self.period, self.chunk = act, period, chunk
+        self.actor, self.period, self.approach, self.chunk = act, period, approach, chunk
         seen: list[Any] = [keys.ROBOT_STATE, keys.GOAL]
         self.in_keys = seen + ([keys.STEP_COUNT] if period > 1 else [])
         written: list[Any] = [keys.ACTION]
@@ -47,14 +55,26 @@ class PolicyPlanner(TensorDictModuleBase):
 
     @classmethod
     def from_pretrained(
-        cls, name_or_path: str | Path = "trapper", *, period: int = 1, chunk: int | None = None
+        cls,
+        name_or_path: str | Path = "trapper",
+        *,
+        period: int = 1,
+        approach: Approach | None = None,
+        chunk: int | None = None,
     ) -> PolicyPlanner:
-        """Planner with the actor that ships under a name, or is in a file or folder; raises `WeightsError`."""
-        return cls(Actor.from_pretrained(name_or_path).requires_grad_(False), period=period, chunk=chunk)
+        """Planner with the actor that ships under a name, or is in a file or folder; raises `WeightsError`.
+
+        The one of the name ``trapper`` keeps within the reach of its arm.
+        """
+        approach = approach or (Approach() if str(name_or_path) == "trapper" else None)
+        actor = Actor.from_pretrained(name_or_path).requires_grad_(False)
+        return cls(actor, period=period, approach=approach, chunk=chunk)
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         """Write ``action`` (*B, A); raises `InputError` for a missing key, a wrong shape, or a NaN."""
         state, goal = (read(tensordict, key, "PolicyPlanner") for key in (keys.ROBOT_STATE, keys.GOAL))
+        if self.approach is not None:
+            goal = within_reach(goal, self.approach)
         if self.period == 1:
             tensordict.set(keys.ACTION, self._act(state, goal))
             return tensordict

@@ -177,8 +177,9 @@ def _arrivals(arguments: CollectArguments, index: int, planner: StaticPlanner) -
     """Runs of the static planner, whole sequences of every arm."""
     scene = TrapperScene()
     task = ReachingTask(planner, arguments.num_envs, scene=scene, num_threads=arguments.threads)
+    runs = trapper_runs(scene, restless=getattr(planner, "restless", False))
     draw = torch.Generator().manual_seed(arguments.seed * 1_000_003 + index)
-    parts = [record_runs(task, trapper_runs(scene), draw) for _ in _shard_rows(arguments, index)]
+    parts = [record_runs(task, runs, draw) for _ in _shard_rows(arguments, index)]
     return {name: torch.cat([part[name] for part in parts]) for name in parts[0]}
 
 

@@ -47,7 +47,9 @@ class RunPlan:
     sequence: int = 400
     """Length of a sequence of runs, which begins at the start."""
     longest: int = 240
-    """A run that has neither arrived nor come to rest by then is given up, and teaches nothing."""
+    """A run that has neither arrived nor come to rest by then is given up."""
+    restless: bool = False
+    """The arm never comes to rest: a run that is given up never arrives. Otherwise such a run teaches nothing."""
     redirected: float = 0.35
     """Share of runs that are given another goal on their way, and teach nothing themselves."""
     redirected_within: int = 90
@@ -56,9 +58,10 @@ class RunPlan:
     """By then a new goal has set an arm in motion."""
 
 
-def trapper_runs(scene: TrapperScene) -> RunPlan:
+def trapper_runs(scene: TrapperScene, *, restless: bool = False) -> RunPlan:
     """Goals of `draw_goals`; a UR5 whose joints are slower than `AT_REST` is at rest."""
     return RunPlan(
+        restless=restless,
         goals=lambda count, draw: draw_goals(scene, count, draw),
         at_rest=lambda state: (state[:, 6:12].abs() < AT_REST).all(-1),
     )
@@ -91,10 +94,11 @@ def record_runs(task: RunningTask, plan: RunPlan, draw: torch.Generator) -> dict
         age = step - given
         arrived = task.is_reached(goal)
         still = plan.at_rest(states[step]) & (age > plan.starting)
-        ended = arrived | still | (age >= turning) | (age >= plan.longest)
+        given_up = age >= plan.longest
+        ended = arrived | still | (age >= turning) | given_up
         rows = ended.nonzero().squeeze(-1)
         if len(rows):
-            teaches = rows[(arrived | still)[rows]]
+            teaches = rows[(arrived | still | (given_up & plan.restless))[rows]]
             taken = given[teaches].unsqueeze(-1) + _within(step - given[teaches], draw)
             samples.append(
                 {

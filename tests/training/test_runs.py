@@ -1,0 +1,54 @@
+"""What runs of a static planner teach: an arm that swings about a place for ever."""
+
+import torch
+from torchdyn_plan.training.runs import RunPlan, record_runs
+
+SIZE = 4
+
+
+class Swinging:
+    """Arms that reach goals on the left of x = 0 after ten steps, and never those on its right, but never rest."""
+
+    def __init__(self, count: int) -> None:
+        self.count, self.steps, self.goal = count, torch.zeros(count), None
+
+    @property
+    def robot_state(self) -> torch.Tensor:
+        return torch.ones(self.count, SIZE)
+
+    def reset(self) -> None:
+        self.steps[:] = 0
+
+    def is_reached(self, goal: torch.Tensor) -> torch.Tensor:
+        return (goal[:, 0] < 0) & (self.steps >= 10)
+
+    def step(self, goal: torch.Tensor) -> None:
+        same = self.goal is not None and (goal == self.goal).all(-1)
+        self.steps = torch.where(torch.as_tensor(same), self.steps + 1, 1.0)
+        self.goal = goal
+
+
+def runs(restless: bool) -> dict[str, torch.Tensor]:
+    plan = RunPlan(
+        goals=lambda count, draw: torch.rand(count, 3, generator=draw) - 0.5,
+        at_rest=lambda state: (state == 0).all(-1),
+        sequence=100,
+        longest=40,
+        redirected=0.0,
+        restless=restless,
+    )
+    return record_runs(Swinging(16), plan, torch.Generator().manual_seed(0))
+
+
+def test_a_restless_arm_that_is_given_up_never_arrives() -> None:
+    found = runs(restless=True)
+    never, beyond = found["arrival"] < 0, found["goal"][:, 0] > 0
+    assert torch.equal(never, beyond)
+    assert never.any()
+    assert (~never).any()
+
+
+def test_otherwise_a_run_that_is_given_up_teaches_nothing() -> None:
+    found = runs(restless=False)
+    assert (found["arrival"] >= 0).all()
+    assert (found["goal"][:, 0] < 0).all()
