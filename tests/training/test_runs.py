@@ -1,6 +1,7 @@
 """What runs of a static planner teach: an arm that swings about a place for ever."""
 
 import torch
+
 from torchdyn_plan.training.runs import RunPlan, record_runs
 
 SIZE = 4
