@@ -6,6 +6,7 @@ import copy
 import csv
 import io
 import json
+import logging
 import time
 from dataclasses import asdict
 from pathlib import Path
@@ -72,6 +73,8 @@ def fit_policy(
         TrainingError: a loss is NaN, or the checkpoint is damaged, of another task, or has other settings.
     """
     check_number("score_every", score_every, minimum=1, integer=True)
+    # TorchRL tells of every storage that it makes, in between the progress bar.
+    logging.getLogger("torchrl").setLevel(logging.WARNING)
     threads = torch.get_num_threads()
     torch.set_num_threads(1)
     try:
