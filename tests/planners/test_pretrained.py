@@ -13,6 +13,7 @@ from torchdyn_plan.planners import (
     OracleTrajectory,
     PolicyPlanner,
 )
+from torchdyn_plan.planners.approach import Approach
 from torchdyn_plan.planners.meeting import CAUTIOUS, WAITING
 
 
@@ -55,7 +56,7 @@ def test_a_learned_policy_comes_with_its_own_arrival_times(shipped, due):
     actor.save_pretrained(shipped[0] / "policy-trapper.safetensors")
     eta.save_pretrained(shipped[0] / "eta-trapper-rl.safetensors")
     planner = DynamicPlanner.from_pretrained("trapper-rl")
-    by_hand = DynamicPlanner(PolicyPlanner(actor.eval()), shipped[1][0].eval(), eta.eval())
+    by_hand = DynamicPlanner(PolicyPlanner(actor.eval(), approach=Approach()), shipped[1][0].eval(), eta.eval())
     with torch.no_grad():
         one, other = planner(due.clone()), by_hand(due.clone())
     assert_same(one, other)
