@@ -14,7 +14,7 @@ from torchdyn_plan import keys
 from torchdyn_plan.checks import check_finite, check_number, check_trailing_shape
 from torchdyn_plan.planners.dynamic import DynamicPlanner
 from torchdyn_plan.planners.protocol import ArrivalPredictor, GoalSearch, StaticPlanner, keys_read, keys_written, read
-from torchdyn_plan.planners.schedule import ReplanSchedule, Schedule
+from torchdyn_plan.planners.schedule import Schedule
 from torchdyn_plan.planners.search import SearchResult
 
 if TYPE_CHECKING:
@@ -62,11 +62,13 @@ class WaitAtEnd(DynamicPlanner):
         eta: ArrivalPredictor,
         *,
         search: GoalSearch | None = None,
-        schedule: ReplanSchedule | None = None,
+        schedule: Schedule | None = None,
+        latency: int = 0,
         chunk: int | None = None,
     ) -> None:
         """Join the parts as `DynamicPlanner` does; ``search`` is `EndOfForecast` by default."""
-        super().__init__(static, forecaster, eta, search=search or EndOfForecast(), schedule=schedule, chunk=chunk)
+        search = search or EndOfForecast()
+        super().__init__(static, forecaster, eta, search=search, schedule=schedule, latency=latency, chunk=chunk)
 
 
 class RecordedFuture(nn.Module):
