@@ -158,31 +158,3 @@ BAD += [("steps", 0), ("steps", 2.5), ("choices", 0), ("speed", float("nan"))]
 def test_a_bad_setting_is_named(name, value):
     with pytest.raises(InputError, match=f"{name}.*{value}"):
         Drop(**{name: value})
-
-
-def test_near_the_axis_the_box_comes_down_as_slowly_as_its_speeds_say():
-    drop = Drop(speeds=((0.2, 0.002), (0.4, 0.004), (0.8, 0.02)), axis=(0.0, -1.0))
-    away = torch.tensor([0.1, 0.2, 0.3, 0.4, 0.41, 2.0])
-    tool = torch.stack([torch.zeros(6), away - 1.0, torch.full((6,), 0.2)], dim=-1)
-    expected = torch.tensor([0.002, 0.002, 0.003, 0.004, 0.0044, 0.0045])
-    torch.testing.assert_close(drop.fastest(tool), expected, rtol=0, atol=1e-6)
-    heights = drop.descent(tool[:, 2], torch.zeros(6), drop.fastest(tool))
-    torch.testing.assert_close(heights[:, -2] - heights[:, -1], expected, rtol=0, atol=1e-6)
-    assert torch.equal(drop.fastest(tool.reshape(2, 3, 3)), drop.fastest(tool).reshape(2, 3))
-
-
-def test_speeds_that_say_the_same_everywhere_change_nothing():
-    random = torch.Generator().manual_seed(0)
-    plain, same = Drop(), Drop(speeds=((0.1, 0.0045), (0.9, 0.0045)))
-    path = 0.1 * torch.randn(50, plain.outlook, 3, generator=random)
-    tool = torch.tensor([0.0, 0.0, 0.1]) + 0.02 * torch.randn(50, 3, generator=random)
-    step = 0.002 * torch.randn(50, 3, generator=random)
-    assert torch.equal(plain.clearance(path, tool, step), same.clearance(path, tool, step))
-    slower = Drop(speeds=((0.1, 0.002), (0.9, 0.002)))
-    assert not torch.equal(plain.clearance(path, tool, step), slower.clearance(path, tool, step))
-
-
-@pytest.mark.parametrize("speeds", [((0.2, 0.002),), ((0.4, 0.002), (0.2, 0.004)), ((0.2, 0.002), (0.2, 0.004))])
-def test_speeds_out_of_order_are_refused(speeds):
-    with pytest.raises(InputError, match="speeds must be none or at least two, at ascending distances"):
-        Drop(speeds=speeds)

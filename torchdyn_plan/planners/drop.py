@@ -8,7 +8,6 @@ import torch
 from torch import Tensor
 
 from torchdyn_plan.checks import check_number
-from torchdyn_plan.errors import InputError
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -37,51 +36,28 @@ class Drop:
     """Moments to begin, from now on, that are compared."""
     hurry: float = 0.002
     """Clearance that a step of waiting must gain [m/step]."""
-    speeds: tuple[tuple[float, float], ...] = ()
-    """Where the descent is slower: ascending distances from ``axis`` [m], each with the greatest speed there [m/step];
-    in between it is interpolated. With none it is ``speed`` everywhere, and never more."""
-    axis: tuple[float, float] = (0.0, -0.855)
-    """The arm's axis, x and y [m, world]."""
 
     def __post_init__(self) -> None:
         for name in ("radius", "half_width", "speed", "acceleration", "catch_height", "glide", "hurry"):
             check_number(name, getattr(self, name), minimum=0.0)
         for name in ("steps", "choices"):
             check_number(name, getattr(self, name), minimum=1, integer=True)
-        distances = [distance for distance, _ in self.speeds]
-        if len(distances) == 1 or distances != sorted(set(distances)):
-            raise InputError(f"speeds must be none or at least two, at ascending distances, got {self.speeds!r}")
-        for number in (*self.axis, *(value for pair in self.speeds for value in pair)):
-            check_number("speeds and axis", number)
 
     @property
     def outlook(self) -> int:
         """Positions of the target that `clearance` looks at, the present one included."""
         return self.steps + self.choices
 
-    def fastest(self, tool_pos: Tensor) -> Tensor:
-        """Greatest speed of a descent that begins with the box at ``tool_pos`` (*B, 3), ``(*B,)`` [m/step]."""
-        if not self.speeds:
-            return torch.full_like(tool_pos[..., 0], self.speed)
-        distances, speeds = tool_pos.new_tensor(self.speeds).T.contiguous()
-        away = torch.hypot(tool_pos[..., 0] - self.axis[0], tool_pos[..., 1] - self.axis[1])
-        after = torch.bucketize(away, distances).clamp(1, len(self.speeds) - 1)
-        share = (away - distances[after - 1]) / (distances[after] - distances[after - 1])
-        return torch.lerp(speeds[after - 1], speeds[after], share.clamp(0.0, 1.0)).clamp_max(self.speed)
-
-    def descent(self, height: Tensor, speed: Tensor, fastest: Tensor | None = None) -> Tensor:
+    def descent(self, height: Tensor, speed: Tensor) -> Tensor:
         """Heights of the rim 0 … ``steps`` steps after a drop begins, ``(*B, steps + 1)`` [m].
 
         Args:
             height: ``(*B,)`` of the rim when it begins [m].
             speed: ``(*B,)`` of the rim upwards when it begins [m/step].
-            fastest: ``(*B,)`` greatest speed downwards [m/step]; ``self.speed`` if None.
         """
         time = torch.arange(self.steps + 1, device=height.device, dtype=height.dtype)
         faster = (time - 1.0).clamp_min(0.0) * self.acceleration
-        change = speed.unsqueeze(-1) - faster
-        lowest = -self.speed if fastest is None else -fastest.unsqueeze(-1)
-        change = change.clamp_min(lowest) * (time > 0)
+        change = (speed.unsqueeze(-1) - faster).clamp_min(-self.speed) * (time > 0)
         return (height.unsqueeze(-1) + change.cumsum(-1)).clamp_min(self.radius)
 
     def clearance(self, path: Tensor, tool_pos: Tensor, tool_step: Tensor) -> Tensor:
@@ -105,8 +81,7 @@ class Drop:
         # The wall behind a target that rests is the nearest one.
         along = torch.where(heading == 0.0, -window.abs(), window * heading)
 
-        fastest = self.fastest(tool_pos) if self.speeds else None
-        rim = self.descent(tool_pos[..., 2], tool_step[..., 2], fastest).unsqueeze(-2)
+        rim = self.descent(tool_pos[..., 2], tool_step[..., 2]).unsqueeze(-2)
         above = (rim - self.radius).clamp(0.0, self.radius)
         # Half the target's width at the height of the rim.
         reach = (self.radius**2 - above.square()).clamp_min(0.0).sqrt()
@@ -119,9 +94,3 @@ class Drop:
         far = torch.where(met[..., -1] > 0, 0.5 * (self.catch_height - caught_at), 1.0)
         later = self.hurry * torch.arange(self.choices, device=path.device)
         return torch.minimum(near, far.clamp_max(self.half_width)) - later
-
-
-IK_SPEEDS = (
-    (0.15, 0.0026), (0.2, 0.0018), (0.25, 0.0021), (0.3, 0.0025), (0.35, 0.0029), (0.45, 0.0040), (0.6, 0.0060),
-)  # fmt: skip
-"""How fast the `IKPlanner` lets the box down at some distances from its axis, from rest at 105 mm (``Drop.speeds``)."""
