@@ -10,7 +10,7 @@ from torch import Tensor
 
 from torchdyn_plan.checks import check_number
 from torchdyn_plan.envs.scene import TrapperScene
-from torchdyn_plan.envs.trapping import SLACK, is_covered
+from torchdyn_plan.envs.trapping import is_covered, is_in_the_way
 
 TABLE_MARGIN = 0.01
 """A goal less than this above the centre of a ball on the table is on the table [m]."""
@@ -74,25 +74,6 @@ def goal_reward(
     if weights.touch:
         reward = reward - weights.touch * (on_table & is_in_the_way(scene, tool_pos, tool_rotation, ball))
     return reward.unsqueeze(-1)
-
-
-def is_in_the_way(scene: TrapperScene, tool_pos: Tensor, tool_rotation: Tensor, ball_pos: Tensor) -> Tensor:
-    """Whether the rim is below the top of a ball that is not wholly within the walls, so that the two would touch.
-
-    Args:
-        scene: sizes of box and ball.
-        tool_pos: ``(*B, 3)`` centre of the box mouth [m, world].
-        tool_rotation: ``(*B, 3, 3)``, columns are the box's axes in the world.
-        ball_pos: ``(*B, 3)`` [m, world].
-
-    Returns:
-        ``(*B,)`` bool.
-    """
-    offset = ((ball_pos - tool_pos).unsqueeze(-2) @ tool_rotation).squeeze(-2)[..., :2].abs().amax(-1)
-    rim = tool_pos[..., 2] - tool_rotation[..., 2, :2].abs().sum(-1) * scene.box_outer
-    low = rim < ball_pos[..., 2] + scene.ball_radius
-    room = scene.box_half_width - scene.ball_radius + SLACK
-    return low & (offset > room) & (offset < scene.box_outer + scene.ball_radius + SLACK)
 
 
 UPRIGHT = -math.cos(math.radians(15.0))

@@ -21,11 +21,26 @@ def is_covered(scene: TrapperScene, tool_pos: Tensor, tool_rotation: Tensor, bal
     Returns:
         ``(*B,)`` bool.
     """
-    offset = ((ball_pos - tool_pos).unsqueeze(-2) @ tool_rotation).squeeze(-2)
+    offset, tilt = _in_box(scene, tool_pos, tool_rotation, ball_pos)
     room = scene.box_half_width - scene.ball_radius + SLACK
-    inside = offset[..., :2].abs().amax(-1) <= room
-    tilt = tool_rotation[..., 2, :2].abs().sum(-1) * scene.box_outer
-    return inside & (tool_pos[..., 2] + tilt <= scene.ball_radius) & (ball_pos[..., 2] > 0.0)
+    return (offset <= room) & (tool_pos[..., 2] + tilt <= scene.ball_radius) & (ball_pos[..., 2] > 0.0)
+
+
+def is_in_the_way(scene: TrapperScene, tool_pos: Tensor, tool_rotation: Tensor, ball_pos: Tensor) -> Tensor:
+    """Whether the rim is below the top of a ball that is not wholly within the walls, so that the two would touch.
+
+    Arguments and shape as for `is_covered`.
+    """
+    offset, tilt = _in_box(scene, tool_pos, tool_rotation, ball_pos)
+    low = tool_pos[..., 2] - tilt < ball_pos[..., 2] + scene.ball_radius
+    room = scene.box_half_width - scene.ball_radius + SLACK
+    return low & (offset > room) & (offset < scene.box_outer + scene.ball_radius + SLACK)
+
+
+def _in_box(scene: TrapperScene, tool_pos: Tensor, tool_rotation: Tensor, ball_pos: Tensor) -> tuple[Tensor, Tensor]:
+    """Distance of the ball from the box's middle along its axes, and how far the rim hangs down, ``(*B,)`` [m]."""
+    offset = ((ball_pos - tool_pos).unsqueeze(-2) @ tool_rotation).squeeze(-2)
+    return offset[..., :2].abs().amax(-1), tool_rotation[..., 2, :2].abs().sum(-1) * scene.box_outer
 
 
 def is_touched(scene: TrapperScene, tool_pos: Tensor, ball_pos: Tensor) -> Tensor:
