@@ -32,3 +32,16 @@ def test_the_recipe_is_its_authors():
     assert DHER.iterations * DHER.updates == 100_000
     assert DHER.action_penalty / (1.0 - DHER.gamma) == pytest.approx(1.0)
     assert DHER.tau == pytest.approx(1.0 - 0.95)
+
+
+@pytest.mark.parametrize("clip_return", [True, False])
+def test_values_stay_within_what_returns_can_be(clip_return):
+    ddpg = DDPG(ReachTask(velocity=0.02, num_threads=1), dataclasses.replace(SHORT, clip_return=clip_return))
+    ddpg.iterate()
+    batch, last = ddpg.replay.sample(), str(len(ddpg.critic.body) - 1)
+    for value in (1000.0, -1000.0):
+        with torch.no_grad():
+            ddpg.loss.target_value_network_params["module", "body", last, "bias"].data.fill_(value)
+        target = ddpg.loss.value_estimator.value_estimate(batch, target_params=ddpg.loss._cached_target_params)
+        assert bool(((target >= -50.0) & (target <= 0.0)).all()) == clip_return
+        assert ((target - value).abs() < 100.0).all() != clip_return

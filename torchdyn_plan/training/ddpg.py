@@ -19,7 +19,7 @@ from torchdyn_plan import keys
 from torchdyn_plan.errors import TrainingError
 from torchdyn_plan.nets.policy import Actor, Critic
 from torchdyn_plan.training.checkpoint import group
-from torchdyn_plan.training.exploration import PenalisedDDPGLoss, RandomActionModule
+from torchdyn_plan.training.exploration import BoundedTD0, PenalisedDDPGLoss, RandomActionModule
 from torchdyn_plan.training.goal_task import SEEN, DDPGRecipe, GoalReplay, GoalTask, hindsight_replay
 from torchdyn_plan.training.optimise import check_device
 
@@ -38,7 +38,7 @@ class DDPG:
         policy = TensorDictModule(self.actor, in_keys=SEEN, out_keys=[keys.ACTION])
         value = ValueOperator(self.critic, in_keys=[*SEEN, keys.ACTION])
         self.loss = PenalisedDDPGLoss(policy, value, delay_actor=True, delay_value=True)
-        self.loss.make_value_estimator(gamma=recipe.gamma)
+        self.loss.make_value_estimator(self.make_targets())
         self.targets = SoftUpdate(self.loss, tau=recipe.tau)
         groups = [
             {"params": list(self.loss.actor_network_params.values(True, True)), "lr": recipe.lr_actor},
@@ -55,6 +55,15 @@ class DDPG:
         steps: list[Any] = [policy, noise, self.random]
         self.collector: Any = self.make_collector(TensorDictSequential(*steps))
         self._rollouts: Iterator[TensorDictBase] = iter(self.collector)
+
+    def make_targets(self) -> BoundedTD0:
+        """What the critic's targets are computed by."""
+        lowest, highest = (-1.0 / (1.0 - self.recipe.gamma), 0.0) if self.recipe.clip_return else (-math.inf, math.inf)
+        targets = BoundedTD0(
+            lowest=lowest, highest=highest, gamma=self.recipe.gamma, value_network=self.loss.actor_critic
+        )
+        targets.set_keys(value=self.loss.tensor_keys.state_action_value)
+        return targets
 
     def make_collector(self, policy: TensorDictModuleBase) -> BaseCollector:
         """What runs a whole episode of every environment in each round."""

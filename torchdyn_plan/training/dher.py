@@ -98,6 +98,7 @@ class DynamicHindsightReplayBuffer(ReplayBuffer):
         cell: float = 0.01,
         recent: int = 100,
         generator: torch.Generator | None = None,
+        device: torch.device | str = "cpu",
     ) -> None:
         """An empty buffer.
 
@@ -110,6 +111,7 @@ class DynamicHindsightReplayBuffer(ReplayBuffer):
             cell: side of the cells in which points are matched [m].
             recent: episodes over which success is counted.
             generator: source of every draw.
+            device: of the samples; what is stored stays on the CPU.
 
         Raises:
             InputError: ``capacity`` holds no episode, or a number is out of its range.
@@ -122,6 +124,7 @@ class DynamicHindsightReplayBuffer(ReplayBuffer):
         super().__init__(storage=LazyTensorStorage(capacity - capacity % length), batch_size=batch_size)
         self.reward_fn, self.length, self.ratio, self.cell = reward_fn, length, ratio, cell
         self.draw, self._recent, self._count = generator, recent, batch_size
+        self.device = torch.device(device)
         self._history = torch.zeros(0, dtype=torch.bool)
         self._matches: Matches | None = None
 
@@ -169,7 +172,7 @@ class DynamicHindsightReplayBuffer(ReplayBuffer):
             for key in (keys.DESIRED_GOAL, NEXT_DESIRED):
                 batch[key][:relabelled] = source[key]
             batch["next", "reward"] = self.reward_fn(batch)
-        return batch
+        return batch if self.device.type == "cpu" else batch.to(self.device)
 
     def draw_pairs(self, count: int) -> tuple[Tensor, Tensor]:
         """Flat indices ``(count,)`` of transitions, and of those whose goals they are given."""

@@ -1,4 +1,4 @@
-"""What `DDPG` adds to TorchRL's exploration and loss."""
+"""What `DDPG` adds to TorchRL's exploration, loss and value targets."""
 
 from __future__ import annotations
 
@@ -7,7 +7,9 @@ from typing import Any
 import torch
 from tensordict import TensorDictBase
 from tensordict.nn import TensorDictModuleBase
+from torch import Tensor
 from torchrl.objectives import DDPGLoss
+from torchrl.objectives.value import TD0Estimator
 
 from torchdyn_plan import keys
 
@@ -45,3 +47,16 @@ class PenalisedDDPGLoss(DDPGLoss):
             acted = self.value_network(acted)
         value = acted.get(self.tensor_keys.state_action_value).mean()
         return self.action_penalty * effort - value, {}
+
+
+class BoundedTD0(TD0Estimator):
+    """TorchRL's one-step value targets, kept within what a return can be (Andrychowicz et al., 2017, appendix)."""
+
+    def __init__(self, *, lowest: float, highest: float, **settings: Any) -> None:
+        """Bound by ``lowest`` and ``highest``; ``settings`` are TorchRL's."""
+        super().__init__(**settings)
+        self.lowest, self.highest = lowest, highest
+
+    def value_estimate(self, *args: Any, **kwargs: Any) -> Tensor:
+        """TorchRL's, bounded."""
+        return super().value_estimate(*args, **kwargs).clamp(self.lowest, self.highest)

@@ -116,6 +116,8 @@ class DDPGRecipe:
     """Share of actions drawn at random."""
     action_penalty: float = 0.03
     """Weight of the mean squared action in the actor's loss, times the greatest value."""
+    clip_return: bool = False
+    """Whether values stay within the returns that rewards of -1 and 0 can have; for tasks that have no others."""
     clip: float = 10.0
     """Greatest norm of a gradient."""
     seed: int = 0

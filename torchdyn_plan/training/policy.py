@@ -44,6 +44,7 @@ def fit_policy(
     task: GoalTask,
     out: Path,
     *,
+    name: str = Actor.kind,
     recipe: DDPGRecipe | None = None,
     resume: bool = True,
     score_every: int = 20,
@@ -58,7 +59,8 @@ def fit_policy(
 
     Args:
         task: goals, rewards and score.
-        out: gets a folder ``policy`` with checkpoint, ``curve.csv``, TensorBoard's files, weights and card.
+        out: gets a folder ``name`` with checkpoint, ``curve.csv``, TensorBoard's files, weights and card.
+        name: of the folder.
         recipe: rounds, rates and seed.
         resume: whether to continue from the checkpoint in ``out``.
         score_every: rounds from one score to the next.
@@ -79,7 +81,7 @@ def fit_policy(
     torch.set_num_threads(1)
     try:
         training = _Training(
-            task, out / Actor.kind, recipe or DDPGRecipe(), score_every=score_every, workers=workers, device=device
+            task, out / name, recipe or DDPGRecipe(), score_every=score_every, workers=workers, device=device
         )
         return training.run(resume, checkpoint_seconds)
     finally:

@@ -24,7 +24,7 @@ from torchdyn_plan.training.policy import fit_policy
 
 DHER = DDPGRecipe(
     iterations=250, num_envs=20, updates=400, batch=256, capacity=1_000_000, warmup=2, lr_actor=1e-3, lr_critic=1e-3,
-    final_rate=1.0, gamma=0.98, tau=0.05, noise=0.2, random_share=0.3, action_penalty=0.02,
+    final_rate=1.0, gamma=0.98, tau=0.05, noise=0.2, random_share=0.3, action_penalty=0.02, clip_return=True,
 )  # fmt: skip
 """As its authors train: 250,000 steps, 100,000 updates; a penalty of 1 on the squared action, of a return up to 50."""
 
@@ -72,8 +72,9 @@ class ReachTask:
         if self.velocity is None:
             return hindsight_replay(self, recipe, device)
         return DynamicHindsightReplayBuffer(
-            self.reward, capacity=recipe.capacity, length=self.length, batch_size=recipe.batch, ratio=recipe.her_ratio
-        )
+            self.reward, capacity=recipe.capacity, length=self.length, batch_size=recipe.batch, ratio=recipe.her_ratio,
+            device=device,
+        )  # fmt: skip
 
     def reward(self, transitions: TensorDictBase) -> Tensor:
         """`reach_reward` of transitions for the goal after their step, ``(B, 1)``."""
@@ -111,5 +112,6 @@ def train_reach(arguments: TrainArguments) -> Path:
     recipe = DDPGRecipe(**((asdict(DHER) if moving else {}) | given | {"seed": arguments.seed}))
     task = ReachTask(velocity=arguments.velocity if moving else None, num_threads=arguments.threads)
     return fit_policy(
-        task, arguments.out, recipe=recipe, resume=arguments.resume, score_every=10, workers=arguments.workers
-    )
+        task, arguments.out, name=arguments.what, recipe=recipe, resume=arguments.resume, score_every=10,
+        workers=arguments.workers, device=arguments.device,
+    )  # fmt: skip
