@@ -11,7 +11,7 @@ from torch import Tensor
 from torchrl.data import Unbounded
 
 from torchdyn_plan import keys
-from torchdyn_plan.checks import check_finite, check_number, check_trailing_shape
+from torchdyn_plan.checks import check_number
 from torchdyn_plan.envs.episodes import SPLITS
 from torchdyn_plan.envs.rewards import GoalReward, goal_reward
 from torchdyn_plan.envs.scene import TrapperScene
@@ -82,21 +82,18 @@ class TrapperGoalEnv(TrapperEnv):
         return self._with_goal(result, self._steps)
 
     def _step(self, tensordict: TensorDictBase) -> TensorDict:
-        action = tensordict[keys.ACTION]
-        check_trailing_shape(keys.ACTION, action, self.num_envs, 6)
-        check_finite(keys.ACTION, action)
+        action = self._checked_action(tensordict)
         for _ in range(self.period):
             self.simulation.step(action)
         goal = self._goal_at(self._steps)
         self._steps += 1
         self._tool_pos, rotation = self._tool(self.simulation.joint_pos)
-        no = torch.zeros(self.num_envs, dtype=torch.bool)
-        result = self._observe(no)
+        result, truncated = self._observe(), self._is_over
         result[keys.DESIRED_GOAL] = result[keys.GOAL] = goal
         result[keys.TOOL_ROTATION] = rotation
         result["reward"] = goal_reward(self.scene, self.weights, self._tool_pos, rotation, goal)
-        truncated = (self._steps >= self.max_steps).unsqueeze(-1)
-        result["terminated"], result["truncated"], result["done"] = no.unsqueeze(-1), truncated, truncated
+        result["terminated"] = torch.zeros_like(truncated)
+        result["truncated"], result["done"] = truncated, truncated.clone()
         return result
 
     def step_and_maybe_reset(self, tensordict: TensorDictBase) -> tuple[TensorDictBase, TensorDictBase]:

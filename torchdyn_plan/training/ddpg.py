@@ -56,8 +56,8 @@ class DDPG:
         self.collector: Any = self.make_collector(TensorDictSequential(*steps))
         self._rollouts: Iterator[TensorDictBase] = iter(self.collector)
 
-    def make_targets(self) -> BoundedTD0:
-        """What the critic's targets are computed by."""
+    def make_targets(self) -> Any:
+        """What computes the critic's targets."""
         lowest, highest = (-1.0 / (1.0 - self.recipe.gamma), 0.0) if self.recipe.clip_return else (-math.inf, math.inf)
         targets = BoundedTD0(
             lowest=lowest, highest=highest, gamma=self.recipe.gamma, value_network=self.loss.actor_critic

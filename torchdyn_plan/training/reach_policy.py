@@ -109,7 +109,8 @@ def train_reach(arguments: TrainArguments) -> Path:
     if arguments.lr is not None:
         given |= {"lr_critic": arguments.lr, "lr_actor": arguments.lr if moving else arguments.lr / 2}
     given = {name: value for name, value in given.items() if value is not None}
-    recipe = DDPGRecipe(**((asdict(DHER) if moving else {}) | given | {"seed": arguments.seed}))
+    settings: dict[str, Any] = (asdict(DHER) if moving else {}) | given | {"seed": arguments.seed}
+    recipe = DDPGRecipe(**settings)
     task = ReachTask(velocity=arguments.velocity if moving else None, num_threads=arguments.threads)
     return fit_policy(
         task, arguments.out, name=arguments.what, recipe=recipe, resume=arguments.resume, score_every=10,
