@@ -20,8 +20,9 @@ class MovingTargetEnv(EnvBase):
     """N independent episodes of a robot and a target, ``batch_size [num_envs]``, on the CPU.
 
     Entries are those of `torchdyn_plan.keys`. A task says how an episode starts (`_start`), what is seen beside the
-    target (`_robot`, `_flags`), and what a step does (`_step`). Episode i starts as a pure function of (split, seed, i): environments take the next index when they
-    reset, so that the same actions give bit-identical episodes whatever ``num_envs``.
+    target (`_robot`, `_flags`), and what a step does (`_step`). How episode i starts is a pure function of
+    (split, seed, i): environments take the next index when they reset, so that the same actions give bit-identical
+    episodes whatever ``num_envs``.
     """
 
     def __init__(
