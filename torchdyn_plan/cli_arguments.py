@@ -2,9 +2,9 @@
 
 from collections.abc import Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from pathlib import Path
-from typing import Literal, NamedTuple
+from typing import Any, Literal, NamedTuple
 
 from torchdyn_plan.errors import InputError, UsageError
 
@@ -23,7 +23,7 @@ class Task(NamedTuple):
     fastest: float
     """Greatest velocity of the target: m/s in Trapper, metres per control step in Reach."""
     rivals: tuple[str, ...] = ()
-    """Planners that run only when they are named: their weights do not ship."""
+    """Planners that run only when they are named."""
 
 
 TASKS = {
@@ -34,6 +34,9 @@ TASKS = {
 
 MOTIONS = ("straight", "circle", "random")
 """How goals of Reach move."""
+
+GOAL_RANGE = 0.1
+"""How far goals of Reach start from the gripper along either axis, in DHER [m]."""
 
 CONTROL_STEP_MS = 4
 """Length of a control step [ms]."""
@@ -78,16 +81,19 @@ def _check_counts(**counts: tuple[int | None, int]) -> None:
             check_number(name, value, minimum=minimum, integer=True)
 
 
-def _check_target(task: str, velocity: float, friction: float, motion: str) -> None:
+def _check_target(given: "EpisodeArguments") -> None:
     from torchdyn_plan.checks import check_choice, check_number
 
-    check_number("velocity", velocity, minimum=0.0, maximum=TASKS[task].fastest)
-    check_number("friction", friction, minimum=0.0)
-    check_choice("motion", motion, MOTIONS)
-    if task != "trapper" and friction:
-        raise InputError(f"friction is the ball's in Trapper: {task} has none, got {friction!r}")
-    if task != "reach" and motion != "straight":
-        raise InputError(f"motion is the goal's in reach: {task} has none, got {motion!r}")
+    check_number("velocity", given.velocity, minimum=0.0, maximum=TASKS[given.task].fastest)
+    check_number("friction", given.friction, minimum=0.0)
+    check_choice("motion", given.motion, MOTIONS)
+    check_number("goal_range", given.goal_range, minimum=0.0)
+    if given.task != "trapper" and given.friction:
+        raise InputError(f"friction is the ball's in Trapper: {given.task} has none, got {given.friction!r}")
+    if given.task != "reach" and given.motion != "straight":
+        raise InputError(f"motion is the goal's in reach: {given.task} has none, got {given.motion!r}")
+    if given.task != "reach" and given.goal_range != GOAL_RANGE:
+        raise InputError(f"goal_range is the goal's in reach: {given.task} has none, got {given.goal_range!r}")
 
 
 def _known_task(name: str) -> Task:
@@ -106,11 +112,11 @@ def _check_latency(latency_ms: float) -> None:
 
 
 @dataclass(frozen=True, kw_only=True)
-class EvaluateArguments:
-    """Run episodes at one velocity and friction with each planner; print a table and write the results."""
+class EpisodeArguments:
+    """Which episodes are run, and by which planners."""
 
     task: str = "trapper"
-    """What the arm has to do: trapper or reach."""
+    """What the arm has to do: trapper, or reach, whose velocity alone varies in a sweep."""
     planners: tuple[str, ...] = PLANNERS
     """Planners for the moving target: pursuit, wait, corner, oracle, exact, meet; Reach has neither wait nor meet, but
     the rival dher."""
@@ -124,16 +130,25 @@ class EvaluateArguments:
     """Friction loss of the ball [N]."""
     motion: str = "straight"
     """How the goal of Reach moves: straight, circle, or random (straight in any direction)."""
+    goal_range: float = GOAL_RANGE
+    """Goals of Reach on lines start within this of the gripper along either axis [m]: 0.1 in DHER, 0.15 in FetchReach.
+    """
     episodes: int = 100
-    """Number of episodes for each planner, always episodes 0 to N-1."""
+    """Number of episodes for each planner, always episodes 0 to N-1; of a sweep for each value and repeat."""
     seed: int = 0
-    """Which series of episodes."""
+    """Which series of episodes; of a sweep the first one."""
     split: str = "test"
     """Which family of series: test, or dev for tuning."""
     num_envs: int = 64
     """Episodes that run side by side; does not change the results."""
     threads: int = 0
     """Threads of the simulation, 0 for all cores; does not change the results."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class EvaluateArguments(EpisodeArguments):
+    """Run episodes at one velocity and friction with each planner; print a table and write the results."""
+
     latency_ms: float = 0.0
     """Time by which every plan comes late, whole control steps of 4 ms; pursuit plans nothing and has none."""
     compensate: bool = True
@@ -151,7 +166,7 @@ class EvaluateArguments:
             if not self.planners:
                 raise InputError(f"planners must name at least one of {', '.join(task.planners)}")
             _check_names(self.task, self.planners, self.static, self.split)
-            _check_target(self.task, self.velocity, self.friction, self.motion)
+            _check_target(self)
             _check_latency(self.latency_ms)
             if self.latency_ms and self.task != "trapper":
                 raise InputError(f"latency is injected in trapper only, got latency_ms {self.latency_ms:g}")
@@ -166,7 +181,7 @@ class EvaluateArguments:
 
 
 @dataclass(frozen=True, kw_only=True)
-class SweepArguments:
+class SweepArguments(EpisodeArguments):
     """Evaluate along a range of velocities or frictions, as the paper's Figure 4; a killed sweep continues."""
 
     over: Literal["velocity", "friction"]
@@ -175,32 +190,8 @@ class SweepArguments:
     """Folder of the sweep: its points, results.json and the plot. One that holds points already is continued."""
     values: tuple[float, ...] = ()
     """Velocities [m/s] or friction losses [N]; the paper's when none are given."""
-    task: str = "trapper"
-    """What the arm has to do: trapper, or reach, whose velocity alone varies."""
-    planners: tuple[str, ...] = PLANNERS
-    """Planners for the moving target: pursuit, wait, corner, oracle, exact, meet; Reach has neither wait nor meet, but
-    the rival dher."""
-    static: str = ""
-    """Static planner that drives the arm: ik or rl (a learned policy) in Trapper, proportional or rl in Reach. The
-    first of the task's when not given."""
-    velocity: float = 3.0
-    """Velocity of the ball when friction varies [m/s]."""
-    friction: float = 0.0
-    """Friction loss of the ball when velocity varies [N]."""
-    motion: str = "straight"
-    """How the goal of Reach moves: straight, circle, or random (straight in any direction)."""
-    episodes: int = 100
-    """Number of episodes for each planner, value and repeat."""
     repeats: int = 10
     """Series of episodes for each value, with seeds upwards from the first."""
-    seed: int = 0
-    """Seed of the first series."""
-    split: str = "test"
-    """Which family of series: test, or dev for tuning."""
-    num_envs: int = 64
-    """Episodes that run side by side; does not change the results."""
-    threads: int = 0
-    """Threads of the simulation, 0 for all cores; does not change the results."""
 
     def __post_init__(self) -> None:
         with _as_usage_error():
@@ -218,20 +209,13 @@ class SweepArguments:
 
     def point(self, value: float | None, repeat: int) -> EvaluateArguments:
         """The evaluation at one value (None: the fixed ones) and repeat, with nothing written."""
-        fixed = 0.0 if self.task == "reach" else self.velocity
-        return EvaluateArguments(
-            task=self.task,
-            motion=self.motion,
-            planners=self.planners,
-            static=self.static,
-            velocity=value if value is not None and self.over == "velocity" else fixed,
-            friction=value if value is not None and self.over == "friction" else self.friction,
-            episodes=self.episodes,
-            seed=self.seed + repeat,
-            split=self.split,
-            num_envs=self.num_envs,
-            threads=self.threads,
-        )
+        shared: dict[str, Any] = {field.name: getattr(self, field.name) for field in fields(EpisodeArguments)}
+        if self.task == "reach":
+            shared["velocity"] = 0.0
+        if value is not None:
+            shared[self.over] = value
+        shared["seed"] = self.seed + repeat
+        return EvaluateArguments(**shared)
 
 
 @dataclass(frozen=True, kw_only=True)

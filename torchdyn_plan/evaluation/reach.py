@@ -25,8 +25,8 @@ HORIZON = 50
 def run_reach(planners: Mapping[str, Planner], arguments: EvaluateArguments) -> dict[str, EpisodeOutcomes]:
     """Outcomes of the same episodes for each planner; *solvable* are those that a clairvoyant search solves."""
     starts = draw_goals(
-        torch.arange(arguments.episodes), settle(compile_fetch()).tool_pos, motion=arguments.motion, goal_range=0.1,
-        split=arguments.split, seed=arguments.seed,
+        torch.arange(arguments.episodes), settle(compile_fetch()).tool_pos, motion=arguments.motion,
+        goal_range=arguments.goal_range, split=arguments.split, seed=arguments.seed,
     )  # fmt: skip
     found = earliest_meeting(
         starts, motion=arguments.motion, velocity=arguments.velocity, num_threads=arguments.threads
@@ -59,8 +59,8 @@ def run_episodes(
 
     count = arguments.episodes
     env = DynamicReachEnv(
-        min(arguments.num_envs, count), velocity=arguments.velocity, motion=arguments.motion, seed=arguments.seed,
-        split=arguments.split, num_threads=arguments.threads,
+        min(arguments.num_envs, count), velocity=arguments.velocity, motion=arguments.motion,
+        goal_range=arguments.goal_range, seed=arguments.seed, split=arguments.split, num_threads=arguments.threads,
     )  # fmt: skip
     steps, replans = torch.full((count,), -1), torch.zeros(count, dtype=torch.int64)
     started = time.perf_counter()
