@@ -15,7 +15,7 @@ from torchdyn_plan.envs.scene import TrapperScene
 from torchdyn_plan.evaluation.replan_parts import Inputs, Part, in_blocks, networks, replans, searches, steps
 from torchdyn_plan.evaluation.run import one_thread
 from torchdyn_plan.evaluation.timing import figures, sample
-from torchdyn_plan.planners import DynamicPlanner, IKPlanner
+from torchdyn_plan.planners import DynamicPlanner, IKPlanner, MeetingPlanner
 
 BATCHES = (1, 16, 256, 1024, 4096, 16384)
 """Rows that plan at once."""
@@ -31,6 +31,7 @@ TRAINED, FOLDED = "torchdyn_plan", "torchdyn_plan, folded"
 
 def bench(
     planner: DynamicPlanner | None = None,
+    meeting: MeetingPlanner | None = None,
     *,
     batches: Sequence[int] = BATCHES,
     seconds: float = 0.4,
@@ -44,6 +45,7 @@ def bench(
 
     Args:
         planner: an `IKPlanner` made to meet a moving target by networks; the one that ships by default.
+        meeting: the same that waits and drops; the one that ships by default.
         batches: rows that plan at once.
         seconds: time spent on each figure.
         compiled: also measure re-plans and networks compiled; each takes up to three compilations of a minute or less.
@@ -51,11 +53,13 @@ def bench(
     from tqdm import tqdm
 
     planner = planner or DynamicPlanner.from_pretrained("trapper-ik")
+    meeting = meeting or MeetingPlanner.from_pretrained("trapper-ik")
     devices = ["cpu", *(["cuda"] if torch.cuda.is_available() else [])]
     rows = []
-    with one_thread(), torch.no_grad(), tqdm(desc="re-plan", unit="figure", leave=False) as bar:
+    several = torch._dynamo.config.patch(recompile_limit=64)  # The forms share code, and count together.
+    with one_thread(), torch.no_grad(), several, tqdm(desc="re-plan", unit="figure", leave=False) as bar:
         for device in devices:
-            forms = _forms(planner.to(device), device, compiled=compiled)
+            forms = _forms(planner.to(device), meeting.to(device), device, compiled=compiled)
             for batch in batches:
                 seen = observations(batch).to(device)
                 seen.set(keys.PLAN, planner(seen.copy())[keys.PLAN])
@@ -64,6 +68,7 @@ def bench(
                     rows.append(_row(form, seen, device, seconds))
                     bar.update()
     planner.to("cpu")
+    meeting.to("cpu")
     return rows
 
 
@@ -71,9 +76,10 @@ Form = tuple[dict[str, Any], Part, Part, Inputs]
 """What a row is about, what is timed, what it is compared with, and what both read."""
 
 
-def _forms(planner: DynamicPlanner, device: str, *, compiled: bool) -> list[Form]:
+def _forms(planner: DynamicPlanner, meeting: MeetingPlanner, device: str, *, compiled: bool) -> list[Form]:
     """Everything that is timed on ``device``."""
-    plain, folded = ({**networks(one), **replans(one)} for one in (planner, planner.folded()))
+    pairs = (planner, meeting), (planner.folded(), meeting.folded())
+    plain, folded = ({**networks(one), **replans(one, other)} for one, other in pairs)
     forms: list[Form] = []
 
     def add(parts: dict[str, tuple[Part, Inputs]], implementation: str, change: Callable[[Part], Part] | None) -> None:

@@ -24,13 +24,12 @@ PLANNED_STEPS = 60
 SEARCHES = {"corner": CornerSearch(), "exact": ExactSearch(), "exact, coarse to fine": ExactSearch(coarse=4)}
 
 
-def replans(planner: DynamicPlanner) -> dict[str, tuple[Part, Inputs]]:
-    """Whole re-plans, by name, with the networks of ``planner``: goal and arrival steps."""
+def replans(planner: DynamicPlanner, meeting: MeetingPlanner) -> dict[str, tuple[Part, Inputs]]:
+    """Whole re-plans, by name, of ``planner`` with each search and of ``meeting`` as it is: goal and arrival steps."""
     found: dict[str, tuple[Part, Inputs]] = {}
     for name, search in SEARCHES.items():
         other = DynamicPlanner(planner.static, planner.forecaster, planner.eta, search=search)
         found[f"re-plan, {name}"] = partial(_first_two, other.plan), _plan_inputs
-    meeting = MeetingPlanner(planner.static, planner.forecaster, planner.eta)
     found["re-plan, meet"] = partial(_first_two, meeting.plan_ahead), _ahead_inputs
     return found
 
