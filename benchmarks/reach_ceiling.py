@@ -45,6 +45,8 @@ READINGS = {
     "threshold 0.02 m": Reading(threshold=0.02),
     "threshold 0.05 m, FetchReach's": Reading(threshold=0.05),
     "start within 0.15 m, FetchReach's": Reading(goal_range=0.15),
+    "start within 0.15 m, threshold 0.02 m": Reading(goal_range=0.15, threshold=0.02),
+    "start within 0.15 m, any direction": Reading(goal_range=0.15, motion="random"),
     "start at any height": Reading(level=False),
     "any direction": Reading(motion="random"),
     "any direction, threshold 0.02 m": Reading(motion="random", threshold=0.02),
@@ -63,7 +65,7 @@ class Arguments:
     """Episodes a velocity, for DHER's code."""
     other_velocities: tuple[float, ...] = (0.011, 0.021, 0.031, 0.041, 0.051)
     """For the other readings."""
-    other_episodes: int = 300
+    other_episodes: int = 1000
     """Episodes a velocity, for the other readings."""
     readings: tuple[str, ...] = field(default_factory=lambda: tuple(READINGS))
     """Which readings."""
