@@ -15,7 +15,8 @@ from torchdyn_plan.cli_arguments import EvaluateArguments
 from torchdyn_plan.envs import TrapperScene
 from torchdyn_plan.evaluation.intervals import paired_loss, rate
 from torchdyn_plan.evaluation.planners import CHUNK, static_planner
-from torchdyn_plan.evaluation.run import one_thread, record_truth, run_episodes
+from torchdyn_plan.evaluation.play import one_thread
+from torchdyn_plan.evaluation.run import record_truth, run_episodes
 from torchdyn_plan.files import write_json
 from torchdyn_plan.planners import Adaptation, EventSchedule, ExactSearch, MeetingPlanner, SearchResult, search_corners
 from torchdyn_plan.planners.meeting import CAUTIOUS, WAITING

@@ -27,7 +27,8 @@ from torchdyn_plan.envs.trapper import HOLD_STEPS, MAX_STEPS
 from torchdyn_plan.envs.trapping import is_covered
 from torchdyn_plan.evaluation.intervals import rate
 from torchdyn_plan.evaluation.planners import static_planner
-from torchdyn_plan.evaluation.run import one_thread, record_truth
+from torchdyn_plan.evaluation.play import one_thread
+from torchdyn_plan.evaluation.run import record_truth
 from torchdyn_plan.evaluation.solvability import arrival_map
 from torchdyn_plan.files import write_json
 from torchdyn_plan.kinematics import Arm

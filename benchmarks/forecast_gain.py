@@ -19,7 +19,8 @@ from torchdyn_plan.cli_arguments import EvaluateArguments
 from torchdyn_plan.envs.scene import TrapperScene
 from torchdyn_plan.envs.simulation import TrapperSimulation
 from torchdyn_plan.envs.trapper import TrapperEnv
-from torchdyn_plan.evaluation.run import CHUNK, EpisodeLog, record_truth, static_planner
+from torchdyn_plan.evaluation.planners import CHUNK, static_planner
+from torchdyn_plan.evaluation.run import EpisodeLog, record_truth
 from torchdyn_plan.files import write_json
 from torchdyn_plan.planners import Adaptation, MeetingPlanner
 from torchdyn_plan.planners.meeting import CAUTIOUS

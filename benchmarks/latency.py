@@ -18,8 +18,10 @@ from torchdyn_plan.cli_arguments import EvaluateArguments
 from torchdyn_plan.envs.scene import TrapperScene
 from torchdyn_plan.evaluation.intervals import paired_loss
 from torchdyn_plan.evaluation.latency import delay_plans
+from torchdyn_plan.evaluation.planners import PLANNERS
+from torchdyn_plan.evaluation.play import one_thread
 from torchdyn_plan.evaluation.results import summarize
-from torchdyn_plan.evaluation.run import PLANNERS, one_thread, record_truth, run_episodes
+from torchdyn_plan.evaluation.run import record_truth, run_episodes
 from torchdyn_plan.files import write_json
 from torchdyn_plan.versions import library_versions, machine
 

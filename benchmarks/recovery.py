@@ -18,7 +18,8 @@ from torch import Tensor
 from torchdyn_plan import keys
 from torchdyn_plan.envs import TrapperEnv, TrapperScene
 from torchdyn_plan.evaluation.intervals import rate
-from torchdyn_plan.evaluation.run import PLANNERS, one_thread
+from torchdyn_plan.evaluation.planners import PLANNERS
+from torchdyn_plan.evaluation.play import one_thread
 from torchdyn_plan.files import write_json
 from torchdyn_plan.versions import library_versions, machine
 

@@ -20,8 +20,10 @@ from torchdyn_plan import keys
 from torchdyn_plan.cli_arguments import EvaluateArguments
 from torchdyn_plan.envs.scene import TrapperScene
 from torchdyn_plan.evaluation.bench_replan import observations
+from torchdyn_plan.evaluation.planners import PLANNERS
+from torchdyn_plan.evaluation.play import one_thread
 from torchdyn_plan.evaluation.results import summarize
-from torchdyn_plan.evaluation.run import PLANNERS, one_thread, record_truth, run_episodes
+from torchdyn_plan.evaluation.run import record_truth, run_episodes
 from torchdyn_plan.evaluation.timing import figures, sample
 from torchdyn_plan.files import write_json
 from torchdyn_plan.planners import DynamicPlanner, EventSchedule, ReplanSchedule, Schedule

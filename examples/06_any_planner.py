@@ -4,7 +4,6 @@ It knows only MuJoCo's Jacobian. Its arrival times are collected and learned. Th
     python examples/06_any_planner.py --sequences 512 --num-envs 256 --steps 6000 --episodes 1000 --out FILE.json
 """
 
-import dataclasses
 import tempfile
 from pathlib import Path
 
@@ -15,9 +14,10 @@ import tyro
 
 from torchdyn_plan.cli_arguments import CollectArguments, EvaluateArguments
 from torchdyn_plan.envs.scene import TrapperScene
+from torchdyn_plan.evaluation.planners import PLANNERS
 from torchdyn_plan.evaluation.report import format_table
 from torchdyn_plan.evaluation.results import summarize
-from torchdyn_plan.evaluation.run import PLANNERS, record_truth, run_episodes
+from torchdyn_plan.evaluation.run import record_truth, run_episodes
 from torchdyn_plan.files import write_json
 from torchdyn_plan.nets import ETANetwork, Forecaster
 from torchdyn_plan.planners import CallablePlanner, DynamicPlanner, MeetingPlanner
@@ -72,7 +72,7 @@ def main(*, sequences: int = 16, num_envs: int = 16, steps: int = 40, episodes: 
             rows.append(summarize(outcome, planner=name, static=whose, velocity=3.0, friction=0.0))
     print(format_table(rows))
     if out is not None:
-        write_json(out, {"settings": settings, "rows": [dataclasses.asdict(row) for row in rows]})
+        write_json(out, {"settings": settings, "rows": [vars(row) for row in rows]})
 
 
 if __name__ == "__main__":

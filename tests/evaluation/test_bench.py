@@ -2,8 +2,9 @@ import pytest
 import torch
 
 from torchdyn_plan.evaluation import bench_env, bench_replan
+from torchdyn_plan.evaluation.play import play
 from torchdyn_plan.evaluation.replan_parts import in_blocks, steps
-from torchdyn_plan.evaluation.run import EpisodeLog, play
+from torchdyn_plan.evaluation.run import EpisodeLog
 from torchdyn_plan.evaluation.timing import figures, sample
 from torchdyn_plan.nets import ETANetwork, Forecaster
 from torchdyn_plan.planners import DynamicPlanner, IKPlanner, TargetPursuit

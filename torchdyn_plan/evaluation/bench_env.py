@@ -15,7 +15,8 @@ from torchdyn_plan import keys
 from torchdyn_plan.envs.simulation import TrapperSimulation
 from torchdyn_plan.envs.trapper import MAX_STEPS, TrapperEnv
 from torchdyn_plan.evaluation.planners import PLANNERS, Planner
-from torchdyn_plan.evaluation.run import EpisodeLog, one_thread, play
+from torchdyn_plan.evaluation.play import one_thread, play
+from torchdyn_plan.evaluation.run import EpisodeLog
 from torchdyn_plan.evaluation.timing import figures
 from torchdyn_plan.versions import usable_cores
 

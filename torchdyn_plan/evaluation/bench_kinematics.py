@@ -12,9 +12,9 @@ from torch import Tensor
 
 from torchdyn_plan.errors import CompileError
 from torchdyn_plan.evaluation.bench_replan import observations
+from torchdyn_plan.evaluation.play import one_thread
 from torchdyn_plan.evaluation.plots import plot_bench
 from torchdyn_plan.evaluation.rivals import DAMPING, Eaik, Mink, Pinocchio, PytorchKinematics, installed
-from torchdyn_plan.evaluation.run import one_thread
 from torchdyn_plan.evaluation.timing import figures, sample
 from torchdyn_plan.kinematics import Arm, DampedSteps, compiled_pose_and_jacobian, solve_ik
 from torchdyn_plan.planners import IKPlanner

@@ -12,8 +12,8 @@ from torch import Tensor
 
 from torchdyn_plan import keys
 from torchdyn_plan.envs.scene import TrapperScene
+from torchdyn_plan.evaluation.play import one_thread
 from torchdyn_plan.evaluation.replan_parts import Inputs, Part, in_blocks, networks, replans, searches, steps
-from torchdyn_plan.evaluation.run import one_thread
 from torchdyn_plan.evaluation.timing import figures, sample
 from torchdyn_plan.planners import DynamicPlanner, IKPlanner, MeetingPlanner
 

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-import time
 from collections.abc import Mapping
+from dataclasses import dataclass
 
 import torch
 from tensordict import TensorDictBase
@@ -15,6 +15,7 @@ from torchdyn_plan.envs.fetch import compile_fetch, settle
 from torchdyn_plan.envs.goal_motion import GoalStarts, draw_goals, goal_places
 from torchdyn_plan.envs.reach import MAX_STEPS, DynamicReachEnv
 from torchdyn_plan.evaluation.planners import Planner
+from torchdyn_plan.evaluation.play import play_all
 from torchdyn_plan.evaluation.reach_ceiling import earliest_meeting
 from torchdyn_plan.evaluation.results import EpisodeOutcomes
 
@@ -55,46 +56,46 @@ def run_episodes(
         solvable: ``(E,)`` bool, passed on.
         name: shown beside the progress bar.
     """
-    from tqdm import tqdm
-
-    count = arguments.episodes
     env = DynamicReachEnv(
-        min(arguments.num_envs, count), velocity=arguments.velocity, motion=arguments.motion,
+        min(arguments.num_envs, arguments.episodes), velocity=arguments.velocity, motion=arguments.motion,
         goal_range=arguments.goal_range, seed=arguments.seed, split=arguments.split, num_threads=arguments.threads,
     )  # fmt: skip
-    steps, replans = torch.full((count,), -1), torch.zeros(count, dtype=torch.int64)
-    started = time.perf_counter()
-    with torch.no_grad(), tqdm(total=count, desc=name, unit="episode", leave=False) as bar:
-        for first in range(0, count, env.num_envs):
-            rows = torch.arange(first, min(first + env.num_envs, count))
-            reached, replanned = _play(planner, env, future[rows])
-            steps[rows], replans[rows] = reached[: len(rows)], replanned[: len(rows)]
-            bar.update(len(rows))
-    no = torch.zeros(count, dtype=torch.bool)
+    log = ReachLog.empty(arguments.episodes)
+    seconds = play_all(planner, env, log, future, name=name)
+    no = torch.zeros(arguments.episodes, dtype=torch.bool)
     return EpisodeOutcomes(
-        trapped=steps >= 0, steps=steps, replans=replans, touched=no, pocketed=no, solvable=solvable,
-        seconds=time.perf_counter() - started,
+        trapped=log.steps >= 0, steps=log.steps, replans=log.replans, touched=no, pocketed=no, solvable=solvable,
+        seconds=seconds,
     )  # fmt: skip
 
 
-def _play(planner: Planner, env: DynamicReachEnv, future: Tensor) -> tuple[Tensor, Tensor]:
-    """One episode of every environment: first step at the goal (-1: none) and re-plans, ``(N,)`` int64 each."""
-    tensordict: TensorDictBase = env.reset()
-    stepped: TensorDictBase = tensordict
-    reached = torch.full((env.num_envs,), -1)
-    shown = torch.cat([future, future[-1:].expand(env.num_envs - len(future), -1, -1)])
-    for step in range(1, env.max_steps + 1):
-        if keys.TARGET_FUTURE in getattr(planner, "in_keys", ()):
-            tensordict[keys.TARGET_FUTURE] = shown
-        stepped = env.step(planner(tensordict))
-        at = stepped["next", keys.REACHED].squeeze(-1)
-        reached = torch.where((reached < 0) & at, step, reached)
-        if bool((reached > 0).all()):
-            break
+@dataclass
+class ReachLog:
+    """What has happened in each episode so far; every tensor is ``(E,)``."""
+
+    done: Tensor
+    steps: Tensor
+    """First step at the goal, int64, -1 for none."""
+    replans: Tensor
+
+    @classmethod
+    def empty(cls, count: int) -> ReachLog:
+        """The log of ``count`` episodes to come."""
+        none = torch.zeros(count, dtype=torch.int64)
+        return cls(torch.zeros(count, dtype=torch.bool), none - 1, none)
+
+    def add(self, stepped: TensorDictBase) -> int:
+        """Take in one step of all environments; returns how many episodes it ended. What comes later does not count."""
         after: TensorDictBase = stepped.get("next")
-        tensordict = after.exclude("reward")
-        plan = stepped.get(keys.PLAN, None)
-        if plan is not None:
-            tensordict[keys.PLAN] = plan
-    replans = stepped.get((keys.PLAN, "replans"), None)
-    return reached, torch.zeros_like(reached) if replans is None else replans
+        episode = after[keys.EPISODE]
+        rows = (episode < len(self.done)).nonzero().squeeze(-1)
+        rows = rows[~self.done[episode[rows]]]
+        ours = episode[rows]
+        first = after[keys.REACHED].squeeze(-1)[rows] & (self.steps[ours] < 0)
+        self.steps[ours[first]] = after[keys.STEP_COUNT][rows][first]
+        replans = stepped.get((keys.PLAN, "replans"), None)
+        if replans is not None:
+            self.replans[ours] = replans[rows]
+        ended = ours[after["done"].squeeze(-1)[rows]]
+        self.done[ended] = True
+        return len(ended)

@@ -3,9 +3,6 @@
 from __future__ import annotations
 
 import dataclasses
-import time
-from collections.abc import Iterator
-from contextlib import contextmanager
 from pathlib import Path
 
 import torch
@@ -21,6 +18,7 @@ from torchdyn_plan.envs.trapper import MAX_STEPS, TrapperEnv
 from torchdyn_plan.evaluation.evidence import Evidence, find_evidence
 from torchdyn_plan.evaluation.latency import delay_plans
 from torchdyn_plan.evaluation.planners import PLANNERS, Planner, static_planner
+from torchdyn_plan.evaluation.play import one_thread, play_all
 from torchdyn_plan.evaluation.plots import plot_results
 from torchdyn_plan.evaluation.reach import run_reach
 from torchdyn_plan.evaluation.report import format_table
@@ -83,36 +81,13 @@ def run_episodes(
         solvable: ``(E,)`` bool, passed on.
         name: shown beside the progress bar.
     """
-    from tqdm import tqdm
-
-    count = arguments.episodes
     env = TrapperEnv(
-        min(arguments.num_envs, count), velocity=arguments.velocity, friction=arguments.friction, seed=arguments.seed,
-        split=arguments.split, num_threads=arguments.threads,
+        min(arguments.num_envs, arguments.episodes), velocity=arguments.velocity, friction=arguments.friction,
+        seed=arguments.seed, split=arguments.split, num_threads=arguments.threads,
     )  # fmt: skip
-    log = EpisodeLog.empty(count)
-    started = time.perf_counter()
-    with torch.no_grad(), tqdm(total=count, desc=name, unit="episode", leave=False) as bar:
-        for ended in play(planner, env, log, future):
-            bar.update(ended)
-            if bar.n >= count:
-                break
-    return log.outcomes(env.scene, future, solvable, time.perf_counter() - started)
-
-
-def play(planner: Planner, env: TrapperEnv, log: EpisodeLog, future: Tensor | None = None) -> Iterator[int]:
-    """Step all environments once for each value taken, which is the number of ``log``'s episodes that the step ended.
-
-    ``future`` (E, T, 3) is the recorded truth for planners that read ``target_future``.
-    """
-    if keys.TARGET_FUTURE not in getattr(planner, "in_keys", ()):
-        future = None
-    tensordict = env.reset()
-    while True:
-        if future is not None:
-            tensordict[keys.TARGET_FUTURE] = future[tensordict[keys.EPISODE].clamp(max=len(future) - 1)]
-        stepped, tensordict = env.step_and_maybe_reset(planner(tensordict))
-        yield log.add(stepped)
+    log = EpisodeLog.empty(arguments.episodes)
+    seconds = play_all(planner, env, log, future, name=name)
+    return log.outcomes(env.scene, future, solvable, seconds)
 
 
 @dataclasses.dataclass
@@ -179,14 +154,3 @@ class EpisodeLog:
             trapped=self.trapped, steps=self.steps, replans=self.replans, touched=evidence.contact_step >= 0,
             pocketed=self.pocketed, solvable=solvable, seconds=seconds, evidence=evidence,
         )  # fmt: skip
-
-
-@contextmanager
-def one_thread() -> Iterator[None]:
-    """Torch on one thread: networks this small are fastest on one thread, which leaves the cores to the simulation."""
-    threads = torch.get_num_threads()
-    torch.set_num_threads(1)
-    try:
-        yield
-    finally:
-        torch.set_num_threads(threads)
