@@ -35,8 +35,8 @@ TASKS = {
 MOTIONS = ("straight", "circle", "random")
 """How goals of Reach move."""
 
-GOAL_RANGE = 0.1
-"""How far goals of Reach start from the gripper along either axis, in DHER [m]."""
+DHER_READING: dict[str, Any] = {"motion": "straight", "goal_range": 0.1, "threshold": 0.01}
+"""How DHER's authors have the goals of Reach move and start, and when a gripper is at one."""
 
 CONTROL_STEP_MS = 4
 """Length of a control step [ms]."""
@@ -88,12 +88,13 @@ def _check_target(given: "EpisodeArguments") -> None:
     check_number("friction", given.friction, minimum=0.0)
     check_choice("motion", given.motion, MOTIONS)
     check_number("goal_range", given.goal_range, minimum=0.0)
+    check_number("threshold", given.threshold, minimum=1e-6)
     if given.task != "trapper" and given.friction:
         raise InputError(f"friction is the ball's in Trapper: {given.task} has none, got {given.friction!r}")
-    if given.task != "reach" and given.motion != "straight":
-        raise InputError(f"motion is the goal's in reach: {given.task} has none, got {given.motion!r}")
-    if given.task != "reach" and given.goal_range != GOAL_RANGE:
-        raise InputError(f"goal_range is the goal's in reach: {given.task} has none, got {given.goal_range!r}")
+    for name, default in DHER_READING.items():
+        value = getattr(given, name)
+        if given.task != "reach" and value != default:
+            raise InputError(f"{name} is the goal's in reach: {given.task} has none, got {value!r}")
 
 
 def _known_task(name: str) -> Task:
@@ -128,11 +129,13 @@ class EpisodeArguments:
     """
     friction: float = 0.0
     """Friction loss of the ball [N]."""
-    motion: str = "straight"
+    motion: str = DHER_READING["motion"]
     """How the goal of Reach moves: straight, circle, or random (straight in any direction)."""
-    goal_range: float = GOAL_RANGE
+    goal_range: float = DHER_READING["goal_range"]
     """Goals of Reach on lines start within this of the gripper along either axis [m]: 0.1 in DHER, 0.15 in FetchReach.
     """
+    threshold: float = DHER_READING["threshold"]
+    """A gripper within this of its goal in Reach is there [m]: 0.01 in DHER, 0.05 in FetchReach."""
     episodes: int = 100
     """Number of episodes for each planner, always episodes 0 to N-1; of a sweep for each value and repeat."""
     seed: int = 0

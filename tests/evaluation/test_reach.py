@@ -90,6 +90,14 @@ def test_tables_and_plots_name_the_paper(outcomes, tmp_path):
     assert (tmp_path / "figure.png").stat().st_size > 10_000
 
 
+def test_other_readings_of_the_task_change_what_is_solved(outcomes):
+    near = run_reach({"oracle": oracle()}, setting(threshold=0.05))["oracle"]
+    far = run_reach({"oracle": oracle()}, setting(goal_range=0.3))["oracle"]
+    for name in ("solvable", "trapped"):
+        usual, more, fewer = (getattr(found, name).sum() for found in (outcomes["oracle"], near, far))
+        assert fewer < usual < more, name
+
+
 def test_episodes_that_cannot_be_reached_are_no_success():
     class Nothing(torch.nn.Module):
         def forward(self, td):
@@ -111,6 +119,10 @@ def test_episodes_that_cannot_be_reached_are_no_success():
         ({"friction": 1.0}, "friction"),
         ({"motion": "zigzag"}, "zigzag"),
         ({"task": "trapper", "motion": "circle", "velocity": 1.0}, "motion"),
+        ({"task": "trapper", "goal_range": 0.15, "velocity": 1.0}, "goal_range"),
+        ({"task": "trapper", "threshold": 0.02, "velocity": 1.0}, "threshold"),
+        ({"threshold": 0.0}, "threshold"),
+        ({"goal_range": -0.1}, "goal_range"),
     ],
 )
 def test_bad_settings_are_named(changes, named):

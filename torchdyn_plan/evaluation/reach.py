@@ -30,7 +30,8 @@ def run_reach(planners: Mapping[str, Planner], arguments: EvaluateArguments) -> 
         goal_range=arguments.goal_range, split=arguments.split, seed=arguments.seed,
     )  # fmt: skip
     found = earliest_meeting(
-        starts, motion=arguments.motion, velocity=arguments.velocity, num_threads=arguments.threads
+        starts, motion=arguments.motion, velocity=arguments.velocity, threshold=arguments.threshold,
+        num_threads=arguments.threads,
     )  # fmt: skip
     future = goal_path(starts, arguments, MAX_STEPS + HORIZON)
     return {name: run_episodes(planner, arguments, future, found > 0, name) for name, planner in planners.items()}
@@ -58,7 +59,8 @@ def run_episodes(
     """
     env = DynamicReachEnv(
         min(arguments.num_envs, arguments.episodes), velocity=arguments.velocity, motion=arguments.motion,
-        goal_range=arguments.goal_range, seed=arguments.seed, split=arguments.split, num_threads=arguments.threads,
+        goal_range=arguments.goal_range, threshold=arguments.threshold, seed=arguments.seed, split=arguments.split,
+        num_threads=arguments.threads,
     )  # fmt: skip
     log = ReachLog.empty(arguments.episodes)
     seconds = play_all(planner, env, log, future, name=name)

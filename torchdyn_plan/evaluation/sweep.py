@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Any
 
 from torchdyn_plan.checks import check_writable_folder
-from torchdyn_plan.cli_arguments import GOAL_RANGE, EvaluateArguments, SweepArguments
+from torchdyn_plan.cli_arguments import DHER_READING, EvaluateArguments, SweepArguments
 from torchdyn_plan.errors import InputError
 from torchdyn_plan.evaluation.paper import paper_curve, paper_reach
 from torchdyn_plan.evaluation.plots import plot_reach, plot_sweep
@@ -71,7 +71,7 @@ def _claim_folder(arguments: SweepArguments) -> None:
     if not path.exists():
         write_json(path, identity)
         return
-    there = {"task": "trapper", "motion": "straight", "goal_range": GOAL_RANGE} | _read_json(path)
+    there = {"task": "trapper"} | DHER_READING | _read_json(path)
     for name in (*identity, *there):
         if there.get(name) != identity.get(name):
             raise InputError(
