@@ -25,6 +25,8 @@ SINGLES = 16
 """Rows of a batch that are compared with the same rows computed one by one."""
 FIRST_PLAN = 13
 """Control step of the first plan."""
+COMPILED: dict[str, dict[str, Any]] = {"cpu": {"options": {"cpp_wrapper": True}}, "cuda": {"mode": "reduce-overhead"}}
+"""How `torch.compile` is asked for little work around the kernels: calls from C++, or CUDA graphs."""
 TRAINED, FOLDED = "torchdyn_plan", "torchdyn_plan, folded"
 """Implementations: the networks as they are trained, and their copies for inference."""
 
@@ -91,8 +93,7 @@ def _forms(planner: DynamicPlanner, meeting: MeetingPlanner, device: str, *, com
     add(plain | searches() | steps(planner), TRAINED, None)
     add(folded, FOLDED, None)
     if compiled:
-        mode = "reduce-overhead" if device == "cuda" else "default"
-        add(folded, FOLDED, partial(torch.compile, fullgraph=True, mode=mode))
+        add(folded, FOLDED, partial(torch.compile, fullgraph=True, **COMPILED[device]))
     return forms
 
 
