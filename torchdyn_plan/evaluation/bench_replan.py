@@ -93,7 +93,8 @@ def _forms(planner: DynamicPlanner, meeting: MeetingPlanner, device: str, *, com
     add(plain | searches() | steps(planner), TRAINED, None)
     add(folded, FOLDED, None)
     if compiled:
-        add(folded, FOLDED, partial(torch.compile, fullgraph=True, **COMPILED[device]))
+        change: Any = partial(torch.compile, fullgraph=True, **COMPILED[device])
+        add(folded, FOLDED, change)
     return forms
 
 
