@@ -71,6 +71,10 @@ class Counted:
         self.schedule, self.watches, self.longest = schedule, schedule.watches, schedule.longest
         self.plans, self.looks = 0, 0
 
+    def start(self, step_count: Tensor) -> Clock:
+        """As the schedule's own."""
+        return self.schedule.start(step_count)
+
     def tick(
         self, clock: Clock | None, step_count: Tensor, *, busy: Tensor | None = None, look: Look
     ) -> tuple[Clock, Tensor]:
