@@ -106,7 +106,7 @@ def trapped(planner: MeetingPlanner, setting: EvaluateArguments) -> Tensor:
             parts = (simulation.ball_pos, simulation._ball_turn, simulation.ball_vel, simulation.ball_spin)
             tensordict[BALL_STATE] = torch.cat(parts, dim=-1)
         stepped, tensordict = env.step_and_maybe_reset(planner(tensordict))
-        log.add(env.scene, stepped)
+        log.add(stepped)
     return log.trapped
 
 

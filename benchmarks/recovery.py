@@ -78,11 +78,11 @@ def measure(arguments: Arguments, planner: str, static: str, velocity: float) ->
             count[number], trapped[number] = drop, success
     missed = (count > 1) | ((count == 1) & ~trapped)
     recovered = trapped & (count > 1)
-    share = rate(int(recovered.sum()), int(missed.sum()))
+    share = rate(int(recovered.sum()), int(missed.sum()))._asdict() if missed.any() else None
     return {
         "planner": planner, "static": static, "velocity": velocity, "episodes": arguments.episodes,
         "missed_first": int(missed.sum()), "lifted_and_tried_again": int((count > 1).sum()),
-        "recovered": int(recovered.sum()), "recovery": share._asdict(),
+        "recovered": int(recovered.sum()), "recovery": share,
     }  # fmt: skip
 
 
