@@ -41,6 +41,7 @@ VARIANTS: dict[str, dict[str, Any]] = {
     "without waiting": {"search": JUST_IN_TIME},
     "without matching": {"pull": 0.0},
     "without uncertainty": {"search": WAITING},
+    "without shunning the arm's axis": {"search": replace(CAUTIOUS, base_pos=None)},
     "with event-triggered re-planning": {"schedule": EventSchedule()},
     "with adaptation": {"adaptation": Adaptation()},
 }

@@ -132,6 +132,25 @@ def test_a_goal_beneath_the_tool_is_reached_now_whatever_the_predictor_says():
     assert not bool(search(forecast, here, never, tool_pos=torch.tensor([0.12, 0.0, 0.2])).reachable)
 
 
+@pytest.mark.parametrize(("near_cost", "passed"), [(0.0, False), (1.0, True)])
+def test_places_near_the_robots_axis_are_left_where_others_are_as_good(near_cost, passed):
+    # From left to right over the axis at (0, 0.1), slowly: all places are in time.
+    forecast, here = line((-0.8, 0.0), (0.008, 0.0))
+    search = ExactSearch(stride=1, first=60, base_pos=(0.0, 0.1), near=0.5, near_cost=near_cost, patience=0.001)
+    result = search(forecast, here, robot(speed=1.0)[0])
+    assert (float(result.goal[0]) > 0.0) == passed
+    away = float((result.goal[:2] - torch.tensor([0.0, 0.1])).norm())
+    assert (away >= 0.5) == passed
+
+
+def test_only_places_within_reach_of_the_axis_lose():
+    forecast, here = paths(20)
+    plain, shy = ExactSearch(), ExactSearch(base_pos=(0.1, 0.0), near=0.12, near_cost=3.0)
+    before, after = (search.candidates(forecast, here, 90).score.expand(20, -1) for search in (plain, shy))
+    away = (plain.candidates(forecast, here, 90).goals[..., :2] - torch.tensor([0.1, 0.0])).norm(dim=-1)
+    torch.testing.assert_close(before - after, 3.0 * ((0.12 - away) / 0.08).clamp(0.0, 1.0))
+
+
 def test_goals_are_clamped_and_lifted():
     forecast, here = line((0.5, -0.6), (0.0, 0.0))
     result = ExactSearch(half_extent=0.4, height=0.1)(forecast, here, robot()[0])
@@ -197,7 +216,14 @@ def test_wrong_shapes_are_named(forecast, here, more):
         ExactSearch()(torch.zeros(forecast), torch.zeros(here), robot()[0], **more)
 
 
-BAD = [("stride", 0), ("stride", 2.5), ("longest_stay", 0), ("half_extent", -1.0), ("height", float("nan"))]
+BAD = [
+    ("near_cost", -1.0),
+    ("stride", 0),
+    ("stride", 2.5),
+    ("longest_stay", 0),
+    ("half_extent", -1.0),
+    ("height", float("nan")),
+]
 BAD += [(name, -0.5) for name in ("lead", "margin", "footprint", "patience", "loyalty", "arrived")]
 
 

@@ -20,6 +20,10 @@ if TYPE_CHECKING:
     from torchdyn_plan.nets.spread import Spread
 
 
+NEAR_EDGE = 0.08
+"""Distance over which goals near the robot's axis come to lose their whole cost [m]."""
+
+
 class Candidates(NamedTuple):
     """Places and times at which the target could be met, K of them."""
 
@@ -46,6 +50,7 @@ class ExactSearch:
     With the defaults the first crossing of e(t) = t wins. If nothing is in time, the least late candidate gives the
     goal, and `reachable` is false.
 
+    With a ``base_pos`` places near the robot's axis count less: there its box comes down too slowly for a fast target.
     With a ``caution`` the probability of meeting counts too: that the robot is there ``lead`` steps before the target
     comes, by the whole distribution of the arrival time, and that the target is within the footprint then, by the
     spread of the forecast.
@@ -78,6 +83,12 @@ class ExactSearch:
 
     Made for the first crossing. It costs meetings where a robot waits: beneath the tool arrival times are not smooth.
     """
+    base_pos: tuple[float, float] | None = None
+    """Vertical axis of the robot, near which it is slow because it folds up [m, world]; None where it is not."""
+    near: float = 0.42
+    """Goals nearer to that axis than this, sideways, are worth less [m]."""
+    near_cost: float = 15.0
+    """Score that they lose, all of it from `NEAR_EDGE` further in."""
     caution: float = 0.0
     """Score of a meeting that is certain over one that is impossible: with c, a probability that is higher by p is
     worth c·p steps of stay, or c·p / ``patience`` steps of waiting. 0 takes the forecast and the mean arrival time as
@@ -88,7 +99,7 @@ class ExactSearch:
         check_number("coarse", self.coarse, minimum=1, integer=True)
         check_number("first", self.first, minimum=0, integer=True)
         check_number("longest_stay", self.longest_stay, minimum=1, integer=True)
-        for name in ("lead", "margin", "footprint", "patience", "loyalty", "arrived", "caution"):
+        for name in ("lead", "margin", "footprint", "patience", "loyalty", "arrived", "near", "near_cost", "caution"):
             check_number(name, getattr(self, name), minimum=0.0)
         if self.caution > 0.0 and self.coarse > 1:
             raise InputError(f"a caution needs all candidates at once: coarse must be 1 with it, got {self.coarse}")
@@ -160,11 +171,19 @@ class ExactSearch:
         """Where and when the target could be met, whatever the robot needs; arguments as for a call."""
         steps, places = self.places(forecast, target_pos, horizon)
         goals, on_table = self.goals(places), places[..., 2] > 0.0
+        cost = self.patience * steps
+        if self.base_pos is not None:
+            cost = cost + self.near_cost * self._nearness(goals)
         if self.footprint == 0.0:
-            return Candidates(goals, steps, 1 - self.patience * steps, None, on_table)
+            return Candidates(goals, steps, 1 - cost, None, on_table)
         path = torch.cat([target_pos.unsqueeze(-2), forecast], dim=-2)
         before, stay = self.stays(path, goals, min(self.first, horizon))
-        return Candidates(goals, steps - before, stay - self.patience * steps, stay, on_table)
+        return Candidates(goals, steps - before, stay - cost, stay, on_table)
+
+    def _nearness(self, goals: Tensor) -> Tensor:
+        """How near to the robot's axis ``goals`` (*B, K, 3) are, ``(*B, K)``: 0 outside of `near`, up to 1."""
+        away = torch.hypot(*(goals[..., axis] - centre for axis, centre in enumerate(self.base_pos or ())))
+        return ((self.near - away) / NEAR_EDGE).clamp(0.0, 1.0)
 
     def places(self, forecast: Tensor, target_pos: Tensor, horizon: int) -> tuple[Tensor, Tensor]:
         """Steps ``(K,)`` of the candidates, and where the target is then, ``(*B, K, 3)`` [m, world]."""
