@@ -68,7 +68,7 @@ class ETAConfig:
 
 
 class ETANetwork(Pretrained, nn.Module):
-    """Estimated time of arrival P_ETA^R (paper, Section III-B3): robot state and goal to a distribution over time.
+    """Estimated time of arrival P_ETA^R (paper, Section III-B.3): robot state and goal to a distribution over time.
 
     Three hidden linear + ReLU layers and a linear one. Features of the state enter the first layer separately from
     those of the goal (its place, its offset and distance from the tool), so many goals share one state's work.

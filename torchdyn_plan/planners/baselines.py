@@ -53,7 +53,7 @@ class EndOfForecast:
 
 
 class WaitAtEnd(DynamicPlanner):
-    """Goes to where the forecast ends and waits there: the other extreme beside pursuit (paper, Section I)."""
+    """Goes to where the forecast ends and waits there: the other extreme beside pursuit (paper, III-B.4)."""
 
     def __init__(
         self,
