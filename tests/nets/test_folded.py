@@ -56,6 +56,17 @@ def test_a_folded_forecaster_forecasts_the_same(settings):
     assert forecast.std() > 0.1
 
 
+@pytest.mark.parametrize("settings", [setting for setting in FORECASTERS if setting.get("half_extent")])
+def test_a_folded_forecaster_is_described_the_same(settings):
+    network = forecaster(**settings)
+    history = histories(60, network.config.history)
+    found = network.folded().describe(history.view(5, 12, *history.shape[1:]))
+    for one, other in zip(found, network.describe(history), strict=True):
+        torch.testing.assert_close(one.flatten(0, 1), other, atol=1e-11, rtol=1e-11)
+    assert found[2].any() == bool(settings.get("square_symmetry"))
+    assert not found[2].all()
+
+
 def test_folded_forecasts_turn_exactly_with_their_histories():
     network, history = forecaster(**FORECASTERS[0]).folded(), histories(60)[1:]
     for symmetry in square_symmetries().double():

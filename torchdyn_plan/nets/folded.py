@@ -72,6 +72,16 @@ class FoldedForecaster(Folded):
 
     def forward(self, target_history: Tensor) -> Tensor:
         """Positions at the next F control steps, ``(*B, F, 3)`` [m, world], as `Forecaster.forward` describes."""
+        return self._forecast(target_history)[0]
+
+    def describe(self, target_history: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        """The same forecast, and what a spread is told by, as `Forecaster.describe` describes."""
+        forecast, hidden, turn = self._forecast(target_history)
+        batch = target_history.shape[:-2]
+        return forecast, hidden.view(*batch, self.config.hidden), (turn[:, 0, 0] == 0.0).view(batch)
+
+    def _forecast(self, target_history: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        """Positions (*B, F, 3), hidden features (R, hidden) and how each row was turned (R, 3, 7)."""
         config = self.config
         if not torch.compiler.is_compiling():
             check_trailing_shape("target_history", target_history, config.history, 3)
@@ -81,12 +91,12 @@ class FoldedForecaster(Folded):
         turn = self._turn(history)
         history = torch.bmm(history, turn[..., :3])
         step, now = history[:, 1:] - history[:, :-1], history[:, -1]
-        line = self._line(step, now, step[:, -1])
+        line, hidden = self._line(step, now, step[:, -1])
         if config.half_extent is not None:
             level = line[:, :2]
             level.sub_(level.round()).abs_()
         path = torch.bmm(turn[..., 3:6], line).add_(turn[..., 6:])
-        return path.mT.view(*target_history.shape[:-2], config.horizon, 3)
+        return path.mT.view(*target_history.shape[:-2], config.horizon, 3), hidden, turn
 
     def _turn(self, history: Tensor) -> Tensor:
         """How each row of histories (R, H, 3) is turned, and its line turned back and shifted: ``(R, 3, 7)``."""
@@ -96,8 +106,8 @@ class FoldedForecaster(Folded):
         direction = (now - history[:, -2]).add_(now, alpha=1e-6)
         return self.turns.index_select(0, direction.mm(self.octants).argmax(dim=-1))
 
-    def _line(self, step: Tensor, now: Tensor, newest: Tensor) -> Tensor:
-        """Unfolded line ``(R, 3, F)``; with cushions x and y are in periods, with whole numbers at the far one."""
+    def _line(self, step: Tensor, now: Tensor, newest: Tensor) -> tuple[Tensor, Tensor]:
+        """Unfolded line (R, 3, F) and hidden features; with cushions x and y are in periods, whole at the far one."""
         real = step.any(dim=-1, keepdim=True).to(step.dtype)
         change = torch.addcmul(self.zero, step - step[:, -1:], real, value=1.0 / self.config.change_scale).asinh_()
         features = torch.cat([step, change, real], dim=-1).view(-1, 7)
@@ -115,7 +125,8 @@ class FoldedForecaster(Folded):
         hidden = torch.addmm(self.hidden_bias, hidden, self.hidden_weight).relu_()
         mixed = torch.addmm(self.mix_bias, hidden, self.mix_weight)
         mixed = torch.cat([mixed, now, newest], dim=-1)
-        return torch.addmm(self.head_bias, mixed, self.head_weight).view(len(step), 3, self.config.horizon)
+        line = torch.addmm(self.head_bias, mixed, self.head_weight).view(len(step), 3, self.config.horizon)
+        return line, hidden
 
     def _ahead(self, now: Tensor, newest: Tensor) -> tuple[Tensor, ...]:
         """When and where the newest position and step, ``(R, 3)`` each, lead to a cushion, ``(R, 2)`` each."""

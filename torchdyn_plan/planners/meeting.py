@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import replace
-from typing import TYPE_CHECKING, Any, Self
+from typing import TYPE_CHECKING, Any
 
 import torch
 from tensordict import TensorDict, TensorDictBase
@@ -154,13 +154,6 @@ class MeetingPlanner(DynamicPlanner):
         if self.kept_names and (latency or delivery):
             raise InputError(f"an adaptation judges each plan from when it was made: latency must be 0, got {latency}")
         super().set_latency(latency, delivery)
-
-    def folded(self) -> Self:
-        """As `DynamicPlanner.folded`; a forecaster that a spread reads is left as it is."""
-        other = super().folded()
-        if self.spread is not None:
-            other.forecaster = self.forecaster
-        return other
 
     def _forecast(self, *seen: Tensor) -> tuple[Tensor, dict[str, Any]]:
         """Forecast ``(R, F, 3)`` [m, world] and, if a search reads it, its spread from when the plan takes effect."""
