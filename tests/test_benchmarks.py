@@ -28,8 +28,8 @@ ELSEWHERE = {"diagnose", "killed_training", "measure_arrivals", "policy_curves",
 
 @pytest.mark.parametrize("name", SMALL)
 def test_benchmark_runs(name, tmp_path):
-    if name == "reach_env" and importlib.util.find_spec("gymnasium_robotics") is None:
-        pytest.skip("gymnasium-robotics has the original")
+    if name.startswith("reach") and importlib.util.find_spec("gymnasium_robotics") is None:
+        pytest.skip("gymnasium-robotics has the arm")
     out = tmp_path / "figures.json"
     run = subprocess.run(
         [sys.executable, BENCHMARKS / f"{name}.py", *SMALL[name].split(), "--out", out],
