@@ -227,6 +227,12 @@ BAD = [
 BAD += [(name, -0.5) for name in ("lead", "margin", "footprint", "patience", "loyalty", "arrived")]
 
 
+@pytest.mark.parametrize("bad", [(0.0,), (0.0, float("nan")), (0.0, 0.0, 0.0)])
+def test_an_axis_that_is_no_place_is_named(bad):
+    with pytest.raises(InputError, match="base_pos"):
+        ExactSearch(base_pos=bad)
+
+
 @pytest.mark.parametrize(("name", "value"), BAD)
 def test_a_bad_setting_is_named(name, value):
     with pytest.raises(InputError, match=f"{name}.*{value}"):

@@ -107,7 +107,7 @@ def plot_reach(rows: Sequence[ResultRow], path: Path) -> None:
     if rows[0].motion == "straight":
         for method, colour, name in (("dynamic", COLOURS["corner"], "paper"), ("dher", _GREY, "paper, DHER")):
             axes.plot(*paper_reach(method), "--", color=colour, linewidth=1.2, label=name)
-    axes.set(title=f"Reach, goals move {rows[0].motion}", ylim=(0, 1.02), xlabel=_REACH_AXIS, ylabel="success rate")
+    axes.set(title=f"Reach, goals move: {rows[0].motion}", ylim=(0, 1.02), xlabel=_REACH_AXIS, ylabel="success rate")
     axes.grid(alpha=0.3)
     figure.legend(loc="outside right center", frameon=False)
     _save(figure, path)

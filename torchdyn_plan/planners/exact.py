@@ -101,6 +101,11 @@ class ExactSearch:
         check_number("longest_stay", self.longest_stay, minimum=1, integer=True)
         for name in ("lead", "margin", "footprint", "patience", "loyalty", "arrived", "near", "near_cost", "caution"):
             check_number(name, getattr(self, name), minimum=0.0)
+        if self.base_pos is not None:
+            if len(self.base_pos) != 2:
+                raise InputError(f"base_pos must be x and y [m], got {self.base_pos!r}")
+            for coordinate in self.base_pos:
+                check_number("base_pos", coordinate)
         if self.caution > 0.0 and self.coarse > 1:
             raise InputError(f"a caution needs all candidates at once: coarse must be 1 with it, got {self.coarse}")
         if self.half_extent is not None:
@@ -182,7 +187,9 @@ class ExactSearch:
 
     def _nearness(self, goals: Tensor) -> Tensor:
         """How near to the robot's axis ``goals`` (*B, K, 3) are, ``(*B, K)``: 0 outside of `near`, up to 1."""
-        away = torch.hypot(*(goals[..., axis] - centre for axis, centre in enumerate(self.base_pos or ())))
+        assert self.base_pos is not None
+        x, y = self.base_pos
+        away = torch.hypot(goals[..., 0] - x, goals[..., 1] - y)
         return ((self.near - away) / NEAR_EDGE).clamp(0.0, 1.0)
 
     def places(self, forecast: Tensor, target_pos: Tensor, horizon: int) -> tuple[Tensor, Tensor]:
