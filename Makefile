@@ -1,46 +1,34 @@
 PYTHON ?= python3
 BIN := .venv/bin
-STAMP := .venv/.installed
 
-# The uv on PATH, else one that pip brought, into an environment of its own where pip refuses to touch the system's.
-define UV
-$(shell for uv in uv "$(PYTHON) -m uv" .venv-uv/bin/uv; do $$uv --version >/dev/null 2>&1 && echo "$$uv" && break; done)
-endef
-
-export UV_LINK_MODE ?= copy
+# Set for other work in many a shell: packages from elsewhere would pass for installed, or be installed elsewhere.
+unexport PYTHONPATH PYTHONHOME
+export PIP_USER := 0
 export UV_PYTHON_DOWNLOADS ?= never
 
-.PHONY: demo test check lock uv clean
+.PHONY: demo test check lock environment clean
 
-demo: $(STAMP)
+demo: environment
 	$(BIN)/torchdyn-plan evaluate --static ik --planners pursuit corner oracle meet --velocity 3 --episodes 100 --seed 0 --out runs/demo
 
 # One thread a worker: two pools of threads on the same cores slow each other down.
-test: $(STAMP)
+test: environment
 	OMP_NUM_THREADS=1 $(BIN)/pytest -q -n 2
 
-check: $(STAMP)
+check: environment
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
 	$(BIN)/basedpyright
 	OMP_NUM_THREADS=1 $(BIN)/pytest -q -n 2
 
-lock: uv
-	$(UV) pip compile pyproject.toml --extra cli --group dev --generate-hashes --no-emit-index-url --no-header --universal -q -o requirements.lock
+# For the oldest Python of the project, whichever runs it.
+lock:
+	@"$(PYTHON)" tools/setup_environment.py uv
+	.venv-uv/bin/uv pip compile pyproject.toml --extra cli --group dev --generate-hashes --no-emit-index-url --no-header --universal --python .venv-uv/bin/python --python-version 3.11 --no-cache -q -o requirements.lock
 
-$(STAMP): pyproject.toml requirements.lock
-	@$(MAKE) --no-print-directory uv
-	test -x $(BIN)/python || $(UV) venv --python "$(PYTHON)" .venv
-	$(UV) pip install --python $(BIN)/python --require-hashes -r requirements.lock
-	$(UV) pip install --python $(BIN)/python --no-deps --no-build-isolation -e .
-	@touch $@
-
-uv:
-	@test -n "$(UV)" \
-	  || $(PYTHON) -m pip install --quiet uv 2>/dev/null \
-	  || { $(PYTHON) -m venv .venv-uv && .venv-uv/bin/pip install --quiet uv; } 2>/dev/null \
-	  || $(PYTHON) -m pip install --quiet --user uv 2>/dev/null \
-	  || $(PYTHON) -m pip install --quiet --user --break-system-packages uv
+# A quick look when all is installed.
+environment:
+	@"$(PYTHON)" tools/setup_environment.py
 
 clean:
 	rm -rf .venv .venv-uv .pytest_cache .ruff_cache .hypothesis dist build

@@ -1,4 +1,5 @@
 import json
+import os
 import subprocess
 import sys
 
@@ -199,3 +200,29 @@ def test_a_killed_sweep_continues_and_ends_as_one_that_was_not(tmp_path, monkeyp
     code, _, err = answer([*words, tmp_path / "killed", "--friction", "1"], capsys)
     assert code == 2
     assert "holds a sweep with another configuration: friction is 0.0 there, 1.0 here" in err
+
+
+def test_results_are_saved_though_nobody_reads_the_table(tmp_path):
+    words = f"evaluate --planners pursuit --episodes 2 --num-envs 2 --split dev --threads 1 --out {tmp_path}".split()
+    run = subprocess.Popen(
+        [sys.executable, "-c", "from torchdyn_plan.cli import main; main()", *words],
+        stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True,
+    )  # fmt: skip
+    run.stdout.close()
+    errors = run.stderr.read()
+    assert run.wait(120) == 0, errors
+    assert "Traceback" not in errors
+    assert "BrokenPipe" not in errors
+    assert {"results.json", "episodes.json", "results.png"} <= {file.name for file in tmp_path.iterdir()}
+
+
+@pytest.mark.parametrize("encoding", ["ascii", "latin-1"])
+def test_a_terminal_without_our_signs_still_gets_the_table(tmp_path, encoding):
+    words = f"evaluate --planners pursuit --episodes 2 --num-envs 2 --split dev --threads 1 --out {tmp_path}".split()
+    run = subprocess.run(
+        [sys.executable, "-c", "from torchdyn_plan.cli import main; main()", *words],
+        env={**os.environ, "PYTHONIOENCODING": encoding}, capture_output=True, check=False, timeout=120,
+    )  # fmt: skip
+    assert run.returncode == 0, run.stderr
+    assert b"pursuit" in run.stdout
+    assert (tmp_path / "results.json").is_file()

@@ -2,6 +2,8 @@
 
 import importlib
 import inspect
+import io
+import os
 import sys
 from collections.abc import Callable, Sequence
 from typing import Annotated, Any
@@ -112,9 +114,17 @@ _POSITIONAL = (CollectArguments, TrainArguments, BenchArguments)
 
 def main(words: Sequence[str] | None = None) -> None:
     """Entry of ``torchdyn-plan``: exits 0 when done, 2 on a mistake in the arguments or the world, 130 on Ctrl-C."""
+    for stream in (sys.stdout, sys.stderr):
+        # A terminal without "–" or "─" shows a question mark: a table is no reason to fail.
+        if isinstance(stream, io.TextIOWrapper):
+            stream.reconfigure(errors="replace")
     try:
         arguments = _parse(words)
         COMMANDS[type(arguments)](arguments)
+        sys.stdout.flush()
+    except BrokenPipeError:
+        # Nobody reads on. Python flushes once more at exit: that goes to nowhere.
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
     except TorchdynPlanError as error:
         print(f"torchdyn-plan: error: {error}", file=sys.stderr)
         sys.exit(2)

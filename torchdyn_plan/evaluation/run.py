@@ -31,16 +31,17 @@ HORIZON = 300
 
 
 def evaluate(arguments: EvaluateArguments) -> None:
-    """Run the episodes, print one table, and write results and a plot where ``arguments.out`` says."""
+    """Run the episodes, write results and a plot where ``arguments.out`` says, then print one table."""
     outcomes = run_points(arguments)
     setting = {name: getattr(arguments, name) for name in ("task", "static", "velocity", "friction", "motion")}
     rows = [summarize(outcome, planner=name, **setting) for name, outcome in outcomes.items()]
-    print(format_table(rows))
     if arguments.out is not None:
         scene = fetch_digest() if arguments.task == "reach" else TrapperScene().digest()
         config = dataclasses.asdict(arguments) | {"out": str(arguments.out), "scene": scene}
         write_results(arguments.out, config, rows, outcomes)
         plot_results(rows, arguments.out / "results.png")
+    print(format_table(rows))
+    if arguments.out is not None:
         print(f"\nwritten: {', '.join(str(path) for path in sorted(Path(arguments.out).iterdir()))}")
 
 
