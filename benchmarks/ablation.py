@@ -1,55 +1,57 @@
-"""What each mechanism of the meeting planner is worth: switched off alone, or on alone where it is off by default.
+"""What each mechanism of the wait-and-drop planner is worth: switched off alone.
 
 python benchmarks/ablation.py --out benchmarks/results/ablation.json
 """
 
-from collections.abc import Callable
-from dataclasses import asdict, dataclass, replace
-from pathlib import Path
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
 from typing import Any
 
 import tyro
+from study import Episodes, Row, Setting, Study, change_entries, each, measuring, success_of
 from torch import Tensor
 
-from torchdyn_plan.cli_arguments import EvaluateArguments
 from torchdyn_plan.envs import TrapperScene
-from torchdyn_plan.evaluation.intervals import paired_loss, rate
-from torchdyn_plan.evaluation.planners import CHUNK, static_planner
-from torchdyn_plan.evaluation.play import one_thread
-from torchdyn_plan.evaluation.run import record_truth, run_episodes
-from torchdyn_plan.files import write_json
-from torchdyn_plan.planners import Adaptation, EventSchedule, ExactSearch, MeetingPlanner, SearchResult, search_corners
-from torchdyn_plan.planners.meeting import CAUTIOUS, WAITING
-from torchdyn_plan.versions import library_versions, machine
+from torchdyn_plan.nets.arrival import ArrivalQuery
+from torchdyn_plan.nets.forecast import Forecast
+from torchdyn_plan.planners import EventSchedule, ExactSearch, Meeting, SearchContext, search_corners
+from torchdyn_plan.planners.search.meeting import NO_CONTEXT
+from torchdyn_plan.tasks import load_task
+from torchdyn_plan.tasks.trapper.wait_and_drop import WaitAndDrop, waiting_search
 
-JUST_IN_TIME = replace(WAITING, margin=0.0, patience=1.0, loyalty=0.0, longest_stay=1)
+PLANNER = "wait_and_drop"
+SCENE = TrapperScene()
+WAITING = waiting_search(SCENE, by_probability=False)
+JUST_IN_TIME = replace(WAITING, margin=0.0, waiting_cost=1.0, switching_cost=0.0, longest_dwell=1)
 """The first meeting that the robot can be in time for: no time is left to wait."""
 
 
 class CornersAbove(ExactSearch):
     """The paper's four corners in place of the whole forecast; the goal is above the meeting place all the same."""
 
-    def __call__(self, forecast: Tensor, target_pos: Tensor, eta: Callable[..., Any], **_: Any) -> SearchResult:
+    def __call__(
+        self, forecast: Forecast, target_pos: Tensor, eta: ArrivalQuery, context: SearchContext = NO_CONTEXT
+    ) -> Meeting:
         """Choose as `search_corners` does."""
-        found = search_corners(forecast, target_pos, lambda goals: eta(goals, reading="mode"))
+        found = search_corners(forecast.path, target_pos, eta)
         return found._replace(goal=self.goals(found.goal))
 
 
 VARIANTS: dict[str, dict[str, Any]] = {
-    "meet": {},
+    PLANNER: {},
     "without exact search": {"search": CornersAbove(height=WAITING.height, half_extent=WAITING.half_extent)},
     "without waiting": {"search": JUST_IN_TIME},
-    "without matching": {"pull": 0.0},
+    "without matching": {"maneuver": replace(WaitAndDrop.of(SCENE), pull=0.0)},
     "without uncertainty": {"search": WAITING},
-    "without shunning the arm's axis": {"search": replace(CAUTIOUS, base_pos=None)},
+    "without shunning the arm's axis": {"search": replace(waiting_search(SCENE), base_pos=None)},
     "with event-triggered re-planning": {"schedule": EventSchedule()},
-    "with adaptation": {"adaptation": Adaptation()},
 }
-"""Name → what differs from `MeetingPlanner.from_pretrained`."""
+"""Name to the parts that differ from the planner that ships, which comes first."""
 
 
 @dataclass(frozen=True, kw_only=True)
-class Arguments:
+class Arguments(Episodes):
     """Run every variant on the same episodes."""
 
     velocities: tuple[float, ...] = (3.0, 5.0)
@@ -57,54 +59,31 @@ class Arguments:
     frictions: tuple[float, ...] = (0.0,)
     """Friction losses of the ball [N]."""
     episodes: int = 500
-    """For each variant, velocity and friction."""
     split: str = "test"
-    """Series of episodes: test, or dev."""
-    seed: int = 0
-    """Which series."""
     num_envs: int = 500
-    """Episodes side by side."""
-    out: Path | None = None
-    """JSON file for the figures."""
 
 
-def variant(name: str) -> MeetingPlanner:
-    """The meeting planner with one mechanism changed."""
-    settings = dict(VARIANTS[name])
-    search, adaptation = settings.pop("search", CAUTIOUS), settings.pop("adaptation", None)
-    planner = MeetingPlanner.from_pretrained("trapper-ik", search=search, adaptation=adaptation, chunk=CHUNK)
-    planner.static = static_planner("ik")
-    planner.pull = settings.pop("pull", planner.pull)
-    planner.schedule = settings.pop("schedule", planner.schedule)
-    return planner
+def compare(study: Study, setting: Setting) -> None:
+    """A row for each variant at one setting."""
+    whole: Row | None = None
+    for name in each(list(VARIANTS), str(setting.changes)):
+
+        def measure(name: str = name, whole: Row | None = whole) -> Row:
+            found = success_of(setting.play(setting.planner(PLANNER, **VARIANTS[name]), name))
+            return found | change_entries(whole or found, found)
+
+        row = study.row({"variant": name, **setting.about}, measure)
+        whole = whole or row
 
 
 def main(arguments: Arguments) -> None:
-    """Run, print and write."""
-    rows: list[dict[str, Any]] = []
-    for velocity in arguments.velocities:
-        for friction in arguments.frictions:
-            setting = EvaluateArguments(
-                velocity=velocity, friction=friction, episodes=arguments.episodes, split=arguments.split,
-                seed=arguments.seed, num_envs=arguments.num_envs,
-            )  # fmt: skip
-            whole = None
-            with one_thread():
-                future, solvable = record_truth(setting)
-                for name in VARIANTS:
-                    outcome = run_episodes(variant(name), setting, future, solvable, name)
-                    trapped = outcome.trapped[solvable]
-                    whole = trapped if whole is None else whole
-                    value, low, high = rate(int(trapped.sum()), len(trapped))
-                    row = {"variant": name, "velocity": velocity, "friction": friction, "solvable": len(trapped)}
-                    row |= {"success_solvable": value, "success_solvable_ci": [low, high]}
-                    row |= {"change": [-part for part in paired_loss(whole, trapped)]}
-                    row |= {"replans": float(outcome.replans.double().mean())}
-                    rows.append(row)
-                    print("  ".join(f"{key} {entry}" for key, entry in row.items()), flush=True)
-    if arguments.out is not None:
-        about = {"machine": machine(), "versions": library_versions(), "scene": TrapperScene().digest()}
-        write_json(arguments.out, {"config": asdict(arguments) | {"out": str(arguments.out)}} | about | {"rows": rows})
+    """Run, save and print."""
+    task = load_task("trapper")
+    study = Study(arguments, scene=task.digest())
+    with measuring():
+        for velocity in arguments.velocities:
+            for friction in arguments.frictions:
+                compare(study, Setting(task, arguments, velocity=velocity, friction=friction))
 
 
 if __name__ == "__main__":

@@ -6,103 +6,101 @@ arm. What is still lost with both true is lost by the search and by the static p
     python benchmarks/diagnose.py --out benchmarks/results/diagnose.json
 """
 
-import time
-from dataclasses import asdict, dataclass
-from pathlib import Path
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import partial
 from typing import Any
 
-import torch
 import tyro
-from torch import Tensor
+from study import Episodes, Row, Setting, Study, each, measuring, success_of
 from tqdm import trange
 
 from torchdyn_plan import keys
-from torchdyn_plan.cli_arguments import EvaluateArguments
-from torchdyn_plan.envs.scene import TrapperScene
-from torchdyn_plan.envs.trapper import MAX_STEPS, TrapperEnv
-from torchdyn_plan.evaluation.measured import MeasuredArrival
-from torchdyn_plan.evaluation.paper import paper_rate
-from torchdyn_plan.evaluation.planners import STATIC_CHUNK
-from torchdyn_plan.evaluation.results import EpisodeOutcomes, summarize
-from torchdyn_plan.evaluation.run import EpisodeLog, record_truth
-from torchdyn_plan.files import write_json
-from torchdyn_plan.planners import CornerSearch, DynamicPlanner, IKPlanner
-from torchdyn_plan.planners.baselines import RecordedFuture
-from torchdyn_plan.versions import library_versions, machine
+from torchdyn_plan.evaluation.episodes import EpisodeLog
+from torchdyn_plan.evaluation.results import EpisodeOutcomes, failure_shares
+from torchdyn_plan.planners import CornerSearch, DynamicPlanner, RecordedFuture
+from torchdyn_plan.tasks import load_task
+from torchdyn_plan.tasks.trapper.measured import MeasuredArrival
+
+FORECASTS = ("network", "truth")
+ARRIVALS = ("network", "network, expectation", "measured")
 
 
 @dataclass(frozen=True, kw_only=True)
-class Arguments:
-    """Evaluate corner search with true parts."""
+class Arguments(Episodes):
+    """Evaluate corner search with true parts; all episodes run side by side, so that they re-plan together."""
 
     velocities: tuple[float, ...] = (1.0, 2.0, 3.0, 4.0, 5.0)
     """[m/s]"""
     episodes: int = 128
-    """Episodes a point, all side by side, so that they re-plan together."""
     split: str = "test"
-    """Series of episodes: test, or dev while tuning."""
-    out: Path | None = None
-    """JSON file for the figures."""
+    arrivals: tuple[str, ...] = ARRIVALS
+    """Which arrivals; measured ones take minutes."""
 
 
-def planners() -> dict[str, DynamicPlanner]:
-    """Every combination of learned and true parts."""
-    learned = DynamicPlanner.from_pretrained("trapper-ik", chunk=STATIC_CHUNK)
-    forecasts = {"network": learned.forecaster, "truth": RecordedFuture()}
-    arrivals = {
-        "network": (learned.eta, "mode"),
-        "network, expectation": (learned.eta, "expectation"),
-        "measured": (MeasuredArrival(IKPlanner()), "mode"),
-    }
-    return {
-        f"{forecast} | {arrival}": DynamicPlanner(
-            IKPlanner(chunk=STATIC_CHUNK),
-            forecasts[forecast],
-            eta,
-            search=CornerSearch(reading=reading),
-            chunk=STATIC_CHUNK,
-        )
-        for forecast in forecasts
-        for arrival, (eta, reading) in arrivals.items()
-    }
+def planner_of(setting: Setting, forecast: str, arrival: str) -> DynamicPlanner:
+    """Corner search with learned and true parts."""
+    learned = setting.planner("corner", chunk=setting.task.rows_at_once[1])
+    parts: dict[str, Any] = {}
+    if forecast == "truth":
+        parts["forecaster"] = RecordedFuture()
+    if arrival == "measured":
+        parts["eta"] = MeasuredArrival(setting.task.static_planner())
+    if arrival == "network, expectation":
+        parts["search"] = CornerSearch(estimator="expectation")
+    return learned.with_parts(**parts)
 
 
-@torch.no_grad()
-def run_together(
-    planner: DynamicPlanner, setting: EvaluateArguments, future: Tensor, solvable: Tensor
-) -> EpisodeOutcomes:
+def play_together(planner: Any, setting: Setting) -> EpisodeOutcomes:
     """Outcomes of all episodes side by side, none put back, so that all re-plan and are measured at the same steps."""
-    count, started = setting.episodes, time.perf_counter()
-    env = TrapperEnv(count, velocity=setting.velocity, split=setting.split, seed=setting.seed)
-    log, tensordict = EpisodeLog.empty(count), env.reset()
-    for _ in trange(MAX_STEPS, leave=False):
-        stepped = env.step(planner(tensordict.set(keys.TARGET_FUTURE, future)))
+    task, arguments, truth = setting.task, setting.arguments, setting.truth
+    count = arguments.episodes
+    env = task.make_env(
+        setting.settings, num_envs=count, seed=arguments.seed, split=arguments.split, num_threads=arguments.threads
+    )
+    log, tensordict = EpisodeLog.empty(count, task, env), env.reset()
+    for _ in trange(env.max_steps, leave=False, disable=None):
+        stepped = env.step(planner(tensordict.set(keys.TARGET_FUTURE, truth.future)))
         log.add(stepped)
         tensordict = env.step_mdp(stepped)
-    return log.outcomes(env.scene, future, solvable, time.perf_counter() - started)
+    assert task.judge
+    verdict = task.judge(setting.settings, log, truth)
+    return EpisodeOutcomes(
+        success=log.success,
+        steps=log.steps,
+        replans=log.replans,
+        solvable=truth.solvable,
+        flags=log.flags,
+        cause=verdict.cause,
+        causes=task.causes,
+        seconds=0.0,
+    )
+
+
+def row_of(setting: Setting, forecast: str, arrival: str) -> Row:
+    """Success with these parts, and the paper's with the same forecast."""
+    outcomes = play_together(planner_of(setting, forecast, arrival), setting)
+    task = setting.task
+    assert task.paper
+    known = "oracle" if forecast == "truth" else "corner"
+    paper = task.paper().rate(known, setting.static, setting.settings, solvable=True)
+    success = outcomes.success.double().mean().item()
+    found = {"success": success, "failures": failure_shares(outcomes), "paper_success_solvable": paper}
+    return success_of(outcomes) | found
 
 
 def main(arguments: Arguments) -> None:
-    """Run, print and write."""
-    torch.set_num_threads(1)
-    rows: list[dict[str, Any]] = []
-    print("velocity  forecast | arrival                success  of solvable  paper")
-    for velocity in arguments.velocities:
-        setting = EvaluateArguments(
-            velocity=velocity, episodes=arguments.episodes, num_envs=arguments.episodes, split=arguments.split
-        )  # fmt: skip
-        future, solvable = record_truth(setting)
-        for name, planner in planners().items():
-            outcome = run_together(planner, setting, future, solvable)
-            row = summarize(outcome, planner=name, static="ik", velocity=velocity, friction=0.0)
-            paper = paper_rate("oracle" if "truth" in name else "corner", "ik", "velocity", velocity, solvable=True)
-            print(
-                f"{velocity:8g}  {name:30} {row.success:8.2f} {row.success_solvable or 0.0:12.2f} {paper or 0.0:6.2f}"
-            )
-            rows.append(asdict(row) | {"paper_success_solvable": paper})
-    if arguments.out is not None:
-        about = {"machine": machine(), "versions": library_versions(), "scene": TrapperScene().digest()}
-        write_json(arguments.out, {"config": asdict(arguments) | {"out": str(arguments.out)}} | about | {"rows": rows})
+    """Run, save and print."""
+    task = load_task("trapper")
+    study = Study(arguments, scene=task.digest())
+    cases = [(forecast, arrival) for forecast in FORECASTS for arrival in arguments.arrivals]
+    with measuring():
+        for velocity in arguments.velocities:
+            setting = Setting(task, arguments, velocity=velocity)
+            for forecast, arrival in each(cases, f"{velocity:g} m/s"):
+                about = {"forecast": forecast, "arrival": arrival, **setting.about}
+                study.row(about, partial(row_of, setting, forecast, arrival))
 
 
 if __name__ == "__main__":

@@ -3,26 +3,29 @@
 python benchmarks/joint_speeds.py --out benchmarks/results/joint_speeds.json
 """
 
-from dataclasses import asdict, dataclass
-from pathlib import Path
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
 
 import torch
 import tyro
+from study import Episodes, Row, Setting, Study, measuring
 from torch import Tensor
 from tqdm import tqdm
 
-from torchdyn_plan.envs import TrapperEnv, TrapperScene, TrapperSimulation
-from torchdyn_plan.evaluation.planners import PLANNERS
-from torchdyn_plan.files import write_json
+from torchdyn_plan.envs import TrapperScene, TrapperSimulation
 from torchdyn_plan.kinematics import UR5_LINKS, UR5_SPEED_LIMIT
-from torchdyn_plan.versions import library_versions, machine
+from torchdyn_plan.tasks import load_task
 
 AFTERMATH = 50
 """Control steps after a contact that still count as contact: the arm swings out."""
+TOO_FAST = 1.02
+"""Steps in which a joint is faster than this share of its limit are counted."""
 
 
 @dataclass(frozen=True, kw_only=True)
-class Arguments:
+class Arguments(Episodes):
     """Watch joint speeds."""
 
     planner: str = "pursuit"
@@ -30,19 +33,16 @@ class Arguments:
     velocity: float = 3.0
     """[m/s]"""
     episodes: int = 1000
-    """Number of episodes."""
+    split: str = "test"
     num_envs: int = 200
-    """Episodes side by side."""
-    out: Path | None = None
-    """JSON file for the figures."""
 
 
 class TouchedSimulation(TrapperSimulation):
     """A simulation that tells which arms a contact has pushed in any physics step of the last control step."""
 
-    def __init__(self, num_envs: int, scene: TrapperScene) -> None:
+    def __init__(self, num_envs: int, scene: TrapperScene, *, num_threads: int) -> None:
         """Build the simulation as `TrapperSimulation` does."""
-        super().__init__(num_envs, scene)
+        super().__init__(num_envs, scene, num_threads=num_threads)
         self._first = int(self.model.joint(UR5_LINKS[0].joint).dofadr[0])
         self.touched = torch.zeros(num_envs, dtype=torch.bool)
 
@@ -57,18 +57,23 @@ class TouchedSimulation(TrapperSimulation):
             self.touched |= (force[:, self._first : self._first + len(UR5_LINKS)] != 0).any(-1)
 
 
-@torch.no_grad()
-def main(arguments: Arguments) -> None:
-    """Run, print and write."""
-    torch.set_num_threads(1)
-    env = TrapperEnv(arguments.num_envs, velocity=arguments.velocity, split="test")
-    planner = PLANNERS[arguments.planner]("ik")
-    env.simulation = simulation = TouchedSimulation(arguments.num_envs, env.scene)
-    joints = len(UR5_LINKS)
-    fastest, steps, above = torch.zeros(joints, dtype=torch.float64), 0, 0
+def row_of(setting: Setting, name: str) -> Row:
+    """Greatest speed of each joint over its limit, and how many steps were too fast."""
+    arguments = setting.arguments
+    env: Any = setting.task.make_env(
+        setting.settings,
+        num_envs=arguments.num_envs,
+        seed=arguments.seed,
+        split=arguments.split,
+        num_threads=arguments.threads,
+    )
+    planner = setting.planner(name)
+    env.simulation = simulation = TouchedSimulation(arguments.num_envs, env.scene, num_threads=arguments.threads)
+    fastest = torch.zeros(len(UR5_LINKS), dtype=torch.float64)
+    steps, above = 0, 0
     since = torch.full((arguments.num_envs,), AFTERMATH)
     state = env.reset()
-    with tqdm(total=arguments.episodes, unit="episode") as bar:
+    with tqdm(total=arguments.episodes, unit="episode", leave=False, disable=None) as bar:
         while bar.n < arguments.episodes:
             stepped, state = env.step_and_maybe_reset(planner(state))
             since = torch.where(simulation.touched, 0, since + 1)
@@ -76,16 +81,20 @@ def main(arguments: Arguments) -> None:
             share = stepped["next", "joint_vel"][free].double().abs() / UR5_SPEED_LIMIT
             if len(share):
                 fastest = torch.maximum(fastest, share.amax(0))
-                above += int(share.gt(1.02).any(dim=-1).sum())
+                above += int(share.gt(TOO_FAST).any(dim=-1).sum())
             steps += len(share)
-            bar.update(int(stepped["next", "done"].sum()))
-    for link, value in zip(UR5_LINKS, fastest.tolist(), strict=True):
-        print(f"{link.joint:14} {value:.3f} of the limit")
-    print(f"{above} of {steps} steps outside contact above 1.02")
-    if arguments.out is not None:
-        row = {"fastest": fastest.tolist(), "free_steps": steps, "above_1.02": above}
-        about = {"machine": machine(), "versions": library_versions(), "scene": env.scene.digest()}
-        write_json(arguments.out, {"config": asdict(arguments) | {"out": str(arguments.out)}} | about | {"rows": [row]})
+            bar.n += int(stepped["next", "done"].sum())
+            bar.refresh()
+    return {"fastest": fastest.tolist(), "free_steps": steps, f"above_{TOO_FAST}": above}
+
+
+def main(arguments: Arguments) -> None:
+    """Run, save and print."""
+    task = load_task("trapper")
+    study = Study(arguments, scene=task.digest())
+    setting = Setting(task, arguments, velocity=arguments.velocity)
+    with measuring():
+        study.row({"planner": arguments.planner, **setting.about}, lambda: row_of(setting, arguments.planner))
 
 
 if __name__ == "__main__":

@@ -3,14 +3,16 @@
 python benchmarks/measure_arrivals.py
 """
 
+from __future__ import annotations
+
 from dataclasses import dataclass
 
-import torch
 import tyro
+from study import measuring
 
-from torchdyn_plan.envs.scene import TrapperScene
-from torchdyn_plan.evaluation.planners import static_planner
-from torchdyn_plan.evaluation.solvability import SHIPPED, arrivals_name, measure_arrivals, save_arrivals
+from torchdyn_plan.envs import TrapperScene
+from torchdyn_plan.tasks import load_task
+from torchdyn_plan.tasks.trapper.solvable import SHIPPED, arrivals_name, measure_arrivals, save_arrivals
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -23,9 +25,10 @@ class Arguments:
 
 def main(arguments: Arguments) -> None:
     """Measure and write into the package."""
-    torch.set_num_threads(1)
-    scene = TrapperScene()
-    arrivals = measure_arrivals(static_planner(arguments.static), scene)
+    task, scene = load_task("trapper"), TrapperScene()
+    planner = task.static_planner(arguments.static, chunk=task.rows_at_once[1])
+    with measuring():
+        arrivals = measure_arrivals(planner, scene)
     save_arrivals(arrivals, SHIPPED / arrivals_name(arguments.static, scene))
 
 

@@ -3,9 +3,10 @@
 python benchmarks/policy_peers.py --minutes 20 --out benchmarks/results/policy_peers.json   # needs the extra `peer`
 """
 
+from __future__ import annotations
+
 import time
-from collections.abc import Callable
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -18,22 +19,19 @@ from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.noise import NormalActionNoise
 from stable_baselines3.common.torch_layers import BaseFeaturesExtractor
 from stable_baselines3.common.vec_env import DummyVecEnv
+from study import Output, Row, Study, told
 from torch import Tensor, nn
 
 from torchdyn_plan import keys
-from torchdyn_plan.envs.gym_goals import TrapperGymEnv
-from torchdyn_plan.files import write_json
+from torchdyn_plan.envs.trapper.gym_env import TrapperGymEnv
 from torchdyn_plan.nets.policy import GoalFeatures, PolicyConfig
+from torchdyn_plan.tasks.trapper.policy import TrapperGoalTask
 from torchdyn_plan.training.ddpg import DDPG
 from torchdyn_plan.training.goal_task import DDPGRecipe
-from torchdyn_plan.training.trapper_task import TrapperTask
-from torchdyn_plan.versions import library_versions, machine
-
-Row = dict[str, Any]
 
 
 @dataclass(frozen=True, kw_only=True)
-class Arguments:
+class Arguments(Output):
     """Train both for the same time, one after the other, each with one thread of torch."""
 
     minutes: float = 20.0
@@ -46,15 +44,14 @@ class Arguments:
     """Training time between two scores."""
     seed: int = 0
     """Of both."""
-    out: Path | None = None
-    """JSON file for the figures; a plot is put beside it."""
 
 
 class Clock:
     """Wall time of the training alone."""
 
-    def __init__(self, name: str, task: TrapperTask, arguments: Arguments) -> None:
-        self.name, self.task, self.arguments, self.rows = name, task, arguments, list[Row]()
+    def __init__(self, name: str, task: TrapperGoalTask, study: Study, arguments: Arguments) -> None:
+        self.name, self.task, self.study, self.arguments = name, task, study, arguments
+        self.rows: list[Row] = []
         self.paused, self.scored, self.started = 0.0, 0.0, time.perf_counter()
 
     @property
@@ -67,16 +64,16 @@ class Clock:
         """Whether the time is used up."""
         return self.seconds > 60.0 * self.arguments.minutes
 
-    def tick(self, actor: Callable[..., Tensor], transitions: int, updates: int) -> None:
-        """Score ``actor`` if it is time to, the clock standing still meanwhile."""
+    def tick(self, actor: Any, transitions: int, updates: int) -> None:
+        """Score ``actor``, a function of state and goal, if it is time to, the clock standing still meanwhile."""
         now = self.seconds
         if now - self.scored < self.arguments.score_seconds:
             return
         before = time.perf_counter()
         with torch.no_grad():
             score = self.task.score(actor)
-        self.rows.append({"what": self.name, "seconds": now, "transitions": transitions, "updates": updates} | score)
-        print("  ".join(f"{name} {value}" for name, value in self.rows[-1].items()), flush=True)
+        about = {"what": self.name, "seconds": now, "transitions": transitions, "updates": updates}
+        self.rows.append(self.study.add(about | score))
         self.scored, self.paused = now, self.paused + time.perf_counter() - before
 
     def summary(self) -> Row:
@@ -131,9 +128,9 @@ class Scoring(BaseCallback):
         return not self.clock.is_over
 
 
-def train_ours(task: TrapperTask, arguments: Arguments) -> Clock:
-    """`torchdyn_plan train policy`'s loop with its own recipe."""
-    clock = Clock("torchdyn_plan", task, arguments)
+def train_ours(task: TrapperGoalTask, study: Study, arguments: Arguments) -> Clock:
+    """The loop of ``torchdyn-plan train policy`` with its own recipe."""
+    clock = Clock("torchdyn_plan", task, study, arguments)
     recipe = DDPGRecipe(seed=arguments.seed)
     ddpg = DDPG(task, recipe)
     while not clock.is_over:
@@ -143,9 +140,9 @@ def train_ours(task: TrapperTask, arguments: Arguments) -> Clock:
     return clock
 
 
-def train_peer(task: TrapperTask, arguments: Arguments, statistics: dict[str, Tensor]) -> Clock:
+def train_peer(task: TrapperGoalTask, study: Study, arguments: Arguments, statistics: dict[str, Tensor]) -> Clock:
     """Stable-Baselines3 with the same sizes, rates and ratio of updates to transitions."""
-    clock = Clock("stable-baselines3", task, arguments)
+    clock = Clock("stable-baselines3", task, study, arguments)
     recipe, config = DDPGRecipe(seed=arguments.seed), task.policy_config
     envs = DummyVecEnv(
         [
@@ -157,9 +154,16 @@ def train_peer(task: TrapperTask, arguments: Arguments, statistics: dict[str, Te
     )
     ratio = recipe.updates / (recipe.num_envs * task.length)
     model = stable_baselines3.DDPG(
-        "MultiInputPolicy", envs, learning_rate=recipe.lr_critic, buffer_size=recipe.capacity, batch_size=recipe.batch,
-        tau=recipe.tau, gamma=recipe.gamma, learning_starts=recipe.warmup * recipe.num_envs * task.length,
-        train_freq=(task.length, "step"), gradient_steps=max(1, round(ratio * task.length * arguments.num_envs)),
+        "MultiInputPolicy",
+        envs,
+        learning_rate=recipe.lr_critic,
+        buffer_size=recipe.capacity,
+        batch_size=recipe.batch,
+        tau=recipe.tau,
+        gamma=recipe.gamma,
+        learning_starts=recipe.warmup * recipe.num_envs * task.length,
+        train_freq=(task.length, "step"),
+        gradient_steps=max(1, round(ratio * task.length * arguments.num_envs)),
         action_noise=NormalActionNoise(np.zeros(6), np.full(6, recipe.noise)),
         replay_buffer_class=HerReplayBuffer,
         replay_buffer_kwargs={"n_sampled_goal": 4, "goal_selection_strategy": "future"},
@@ -168,8 +172,9 @@ def train_peer(task: TrapperTask, arguments: Arguments, statistics: dict[str, Te
             "features_extractor_class": PeerFeatures,
             "features_extractor_kwargs": {"statistics": statistics},
         },
-        seed=arguments.seed, device="cpu",
-    )  # fmt: skip
+        seed=arguments.seed,
+        device="cpu",
+    )
     model.learn(10**9, callback=Scoring(clock))
     return clock
 
@@ -192,21 +197,21 @@ def plot(rows: list[Row], target: float, file: Path) -> None:
 
 
 def main(arguments: Arguments) -> None:
-    """Train, print and write."""
+    """Train, save and print; a plot is put beside the file."""
     torch.set_num_threads(1)
-    task = TrapperTask()
+    task = TrapperGoalTask()
+    study = Study(arguments, scene=task.scene.digest(), resume=False)
     sample = task.make_env(32, seed=arguments.seed + 100).rollout(task.length, break_when_any_done=False).reshape(-1)
     features = GoalFeatures(task.policy_config)
     features.set_statistics(sample[keys.OBSERVATION], sample[keys.DESIRED_GOAL])
-    clocks = [train_ours(task, arguments), train_peer(task, arguments, features.state_dict())]
-    summaries, rows = [clock.summary() for clock in clocks], [row for clock in clocks for row in clock.rows]
+    ours = train_ours(task, study, arguments)
+    peer = train_peer(task, study, arguments, features.state_dict())
+    summaries = [clock.summary() for clock in (ours, peer)]
+    study.save(summaries=summaries)
     for summary in summaries:
-        print("  ".join(f"{name} {value}" for name, value in summary.items()))
+        print(told(summary))
     if arguments.out is not None:
-        config = asdict(arguments) | {"out": str(arguments.out)}
-        about = {"machine": machine(), "versions": library_versions(), "scene": task.scene.digest()}
-        write_json(arguments.out, {"config": config} | about | {"summaries": summaries, "rows": rows})
-        plot(rows, arguments.target, arguments.out.with_suffix(".png"))
+        plot(study.rows, arguments.target, arguments.out.with_suffix(".png"))
 
 
 if __name__ == "__main__":

@@ -7,7 +7,6 @@ import torch
 from tensordict import TensorDict
 from torch import Tensor
 
-from torchdyn_plan.nets import Arrival
 from torchdyn_plan.planners import CallablePlanner, DynamicPlanner
 
 STEP = 0.01  # what the robot covers in a control step [m]
@@ -19,13 +18,9 @@ def fly(robot_state: Tensor, goal: Tensor) -> Tensor:
     return way / way.norm(dim=-1, keepdim=True).clamp_min(STEP)
 
 
-class FlightTime:
-    """How long `fly` needs: the part that an `ETANetwork` learns for a robot whose planner has no formula."""
-
-    def arrival(self, robot_state: Tensor, goal: Tensor, *, reading: str = "mode") -> Arrival:
-        """Steps to each goal."""
-        steps = (goal - robot_state).norm(dim=-1) / STEP
-        return Arrival(steps, torch.zeros_like(steps, dtype=torch.bool))
+def flight_time(robot_state: Tensor, goal: Tensor) -> Tensor:
+    """Steps that `fly` needs: what an `ETANetwork` learns for a robot whose planner has no formula."""
+    return (goal - robot_state).norm(dim=-1) / STEP
 
 
 def straight_on(target_history: Tensor) -> Tensor:
@@ -34,7 +29,7 @@ def straight_on(target_history: Tensor) -> Tensor:
     return now + step * torch.arange(1.0, 301.0).unsqueeze(-1)
 
 
-planner = DynamicPlanner(CallablePlanner(fly), straight_on, FlightTime())
+planner = DynamicPlanner(CallablePlanner(fly), straight_on, flight_time)
 robot, target = torch.zeros(1, 3), torch.tensor([[-1.5, 1.0, 0.0]])
 velocity = torch.tensor([[0.008, 0.0, 0.0]])
 history = target.unsqueeze(1).repeat(1, 24, 1)

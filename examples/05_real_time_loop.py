@@ -9,21 +9,14 @@ import time
 import torch
 
 from torchdyn_plan.envs import TrapperEnv
-from torchdyn_plan.planners import Background, MeetingPlanner, measured_latency
+from torchdyn_plan.planners import Background, DynamicPlanner, Plan, measured_latency, observe
 
 STEP = 0.004  # length of a control step [s]
 STEPS = 500  # two seconds
 
 torch.set_num_threads(1)
 env = TrapperEnv(num_envs=1, velocity=2.0, seed=0, num_threads=1)
-planner = MeetingPlanner.from_pretrained("trapper-ik")
-
-
-def plan_once() -> None:
-    """One plan from the start of an episode, as the thread makes it."""
-    seen = (start[key] for key in ("robot_state", "target_pos", "tool_pos", "step_count", "target_history"))
-    with torch.no_grad():
-        planner.plan_ahead(*seen)
+planner = DynamicPlanner.from_pretrained("trapper-ik-wait_and_drop").for_inference()
 
 
 def run_loop() -> tuple[int, int, int]:
@@ -42,10 +35,11 @@ def run_loop() -> tuple[int, int, int]:
     return balls, trapped, overruns
 
 
-start = env.reset()
-latency = measured_latency(plan_once, STEP)
+seen = observe(env.reset(), planner.forecaster)
+with torch.no_grad():
+    latency = measured_latency(lambda: planner.replan(seen, Plan.hold(seen, length=0)), STEP)
 background = Background(latency=latency, deadline=latency + 4)
-planner.set_latency(latency, background)
+planner = planner.with_parts(delivery=background)
 with torch.no_grad():
     balls, trapped, overruns = run_loop()
 background.close()

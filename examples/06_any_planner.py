@@ -1,7 +1,7 @@
 """Another library's inverse kinematics becomes a planner that traps rolling balls, and is measured beside ours.
 
 It knows only MuJoCo's Jacobian. Its arrival times are collected and learned. The defaults are quick; in earnest:
-    python examples/06_any_planner.py --sequences 512 --num-envs 256 --steps 6000 --episodes 1000 --out FILE.json
+    python examples/06_any_planner.py --sequences 512 --num-envs 256 --steps 6000 --episodes 1000 --out FOLDER
 """
 
 import tempfile
@@ -12,17 +12,14 @@ import numpy as np
 import torch
 import tyro
 
-from torchdyn_plan.cli_arguments import CollectArguments, EvaluateArguments
-from torchdyn_plan.envs.scene import TrapperScene
-from torchdyn_plan.evaluation.planners import PLANNERS
-from torchdyn_plan.evaluation.report import format_table
-from torchdyn_plan.evaluation.results import summarize
-from torchdyn_plan.evaluation.run import record_truth, run_episodes
-from torchdyn_plan.files import write_json
-from torchdyn_plan.nets import ETANetwork, Forecaster
-from torchdyn_plan.planners import CallablePlanner, DynamicPlanner, MeetingPlanner
+from torchdyn_plan.envs import TrapperScene
+from torchdyn_plan.evaluation import evaluate
+from torchdyn_plan.nets import ETANetwork
+from torchdyn_plan.planners import CallablePlanner
+from torchdyn_plan.tasks import load_task
+from torchdyn_plan.tasks.trapper.wait_and_drop import waiting_search
 from torchdyn_plan.training.collect import collect
-from torchdyn_plan.training.fit import fit_eta
+from torchdyn_plan.training.train import train
 
 MODEL = TrapperScene().compile()
 DATA, TOOL, FIRST = mujoco.MjData(MODEL), MODEL.site("tool").id, MODEL.joint("shoulder_pan")
@@ -53,26 +50,28 @@ def _drive(joint_pos: np.ndarray, goal: np.ndarray) -> np.ndarray:
     return change / STEP * min(0.25, STEP / max(np.abs(change).max(), 1e-9))
 
 
-def main(*, sequences: int = 16, num_envs: int = 16, steps: int = 40, episodes: int = 4, split: str = "test",
-         out: Path | None = None) -> None:  # fmt: skip
+def main(
+    *, sequences: int = 16, num_envs: int = 16, steps: int = 40, episodes: int = 4, out: Path | None = None
+) -> None:
     """Collect, fit, evaluate at 3 m/s."""
-    settings = {"sequences": sequences, "num_envs": num_envs, "steps": steps, "episodes": episodes, "split": split}
-    torch.set_num_threads(1)
-    static = CallablePlanner(drive, in_keys=("joint_pos", "goal"))
-    with tempfile.TemporaryDirectory() as folder:
-        wanted = CollectArguments(what="arrivals", out=Path(folder), episodes=sequences, num_envs=num_envs, threads=1)
-        collect(wanted, static, name="mj_jac")
-        eta = ETANetwork.from_pretrained(fit_eta(Path(folder), Path(folder), steps=steps))
-    parts = static, Forecaster.from_pretrained("trapper"), eta
-    setting = EvaluateArguments(episodes=episodes, num_envs=min(episodes, 500), split=split, threads=0)
-    truth, rows = record_truth(setting), []
-    for name, kind in (("corner", DynamicPlanner), ("meet", MeetingPlanner)):
-        for whose, tried in (("mj_jac", kind(*parts)), ("ik", PLANNERS[name]("ik"))):
-            outcome = run_episodes(tried, setting, *truth, name)
-            rows.append(summarize(outcome, planner=name, static=whose, velocity=3.0, friction=0.0))
-    print(format_table(rows))
+    task, static = load_task("trapper"), CallablePlanner(drive, in_keys=("joint_pos", "goal"))
+    with tempfile.TemporaryDirectory() as name:
+        data, threads = Path(name), {"num_envs": num_envs, "num_threads": 1}
+        collect(task, "arrivals", data, episodes=sequences, planner=static, name="mj_jac", **threads)
+        eta = ETANetwork.from_pretrained(train(task, "eta", data, data, steps=steps))
+    corner, ours = task.planner("corner", "ik"), task.planner("wait_and_drop", "ik")
+    planners = {
+        "corner, ik": corner,
+        "corner, mj_jac": corner.with_parts(static=static, eta=eta),
+        "wait_and_drop, ik": ours,
+        "wait_and_drop, mj_jac": ours.with_parts(
+            static=static, eta=eta, search=waiting_search(TrapperScene(), by_probability=False)
+        ),
+    }
+    found = evaluate(task, planners, static="ik", velocity=3.0, episodes=episodes, num_envs=500)
+    print(found.table())
     if out is not None:
-        write_json(out, {"settings": settings, "rows": [vars(row) for row in rows]})
+        found.save(out)
 
 
 if __name__ == "__main__":

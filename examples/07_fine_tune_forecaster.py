@@ -10,22 +10,21 @@ from pathlib import Path
 import torch
 from torch import Tensor
 
-from torchdyn_plan.cli_arguments import EvaluateArguments
-from torchdyn_plan.envs.episodes import draw_starts
-from torchdyn_plan.envs.scene import TrapperScene
-from torchdyn_plan.evaluation.run import record_truth, run_episodes
-from torchdyn_plan.evaluation.solvability import record_path
-from torchdyn_plan.nets import ETANetwork, Forecaster
-from torchdyn_plan.planners import DynamicPlanner, ExactSearch, IKPlanner, SoftExactSearch
-from torchdyn_plan.planners.soft import between
+from torchdyn_plan.envs import TrapperScene
+from torchdyn_plan.envs.trapper.starts import draw_starts
+from torchdyn_plan.evaluation import evaluate
+from torchdyn_plan.nets import Forecaster
+from torchdyn_plan.planners import ExactSearch, Observation, Plan, SoftExactSearch
+from torchdyn_plan.planners.search.soft import between
+from torchdyn_plan.tasks import load_task
+from torchdyn_plan.tasks.trapper.solvable import record_path
 
 parser = argparse.ArgumentParser(description=__doc__)
 for name, default in (("steps", 5), ("balls", 32), ("batch", 32), ("lr", 3e-5), ("episodes", 0), ("out", Path())):
     parser.add_argument(f"--{name}", type=type(default), default=default)
 arguments = parser.parse_args()
-scene, static = TrapperScene(), IKPlanner()
-forecaster, eta = Forecaster.from_pretrained("trapper"), ETANetwork.from_pretrained("trapper-ik").requires_grad_(False)
-planner = DynamicPlanner(static, forecaster, eta, search=SoftExactSearch(temperature=2.0))
+scene, task, forecaster = TrapperScene(), load_task("trapper"), Forecaster.from_pretrained("trapper")
+planner = task.planner("corner", "ik").with_parts(forecaster=forecaster, search=SoftExactSearch(temperature=2.0))
 
 
 def roll(first: int, count: int) -> Tensor:
@@ -41,16 +40,18 @@ def situations(paths: Tensor, count: int, draw: torch.Generator) -> tuple[Tensor
     now = torch.randint(13, 300, (count, 1), generator=draw)
     history = paths[ball, (now + torch.arange(-23, 1)).clamp_min(0)]
     joints = torch.tensor(scene.home) + 0.3 * torch.randn(count, 6, generator=draw)
-    tool_pos = static.arm(joints)[:, :3, 3] + torch.tensor(scene.base_pos)
+    tool_pos = planner.static.arm(joints)[:, :3, 3] + torch.tensor(scene.base_pos)
     return torch.cat([joints, 0.0 * joints, tool_pos], dim=-1), history, paths[ball, now + torch.arange(301)]
 
 
 def misses(state: Tensor, history: Tensor, truth: Tensor) -> tuple[Tensor, Tensor]:
     """How far the ball truly is from the goal at the meeting time [m], and how late the robot [steps], where it can."""
-    goal, steps, _, reachable = planner.plan(state, truth[:, 0], history)
-    there = between(truth, steps.unsqueeze(-1)).squeeze(-2)
-    late = (eta.arrival(state, goal, reading="soft").steps - steps).relu()
-    return (there - goal)[reachable, :2].norm(dim=-1), late[reachable]
+    step_count = torch.full((len(state),), 13)
+    seen = Observation(state[:, 12:], truth[:, 0], state, step_count, seen=(history,))
+    plan = planner.replan(seen, Plan.hold(seen, length=0))
+    there = between(truth, plan.arrival_steps.unsqueeze(-1)).squeeze(-2)
+    late = (planner.eta.arrival(state, plan.goal, estimator="soft").steps - plan.arrival_steps).relu()
+    return (there - plan.goal)[plan.reachable, :2].norm(dim=-1), late[plan.reachable]
 
 
 def report(when: str) -> None:
@@ -58,10 +59,8 @@ def report(when: str) -> None:
     miss, late = (figures.detach() for figures in misses(*held_out))
     print(f"{when}: miss {miss.median():.4f} m (median), {late.mean():.2f} steps late")
     if arguments.episodes:
-        setting = EvaluateArguments(episodes=arguments.episodes, num_envs=arguments.episodes, split="dev")
-        exact = DynamicPlanner(static, forecaster, eta, search=ExactSearch())
-        trapped = run_episodes(exact, setting, *record_truth(setting), when).trapped
-        print(f"{when}: {int(trapped.sum())} of {arguments.episodes} balls at 3 m/s trapped (dev)")
+        exact = planner.with_parts(search=ExactSearch())
+        print(evaluate(task, {when.strip(): exact}, episodes=arguments.episodes, split="dev", velocity=3.0).table())
 
 
 paths, draw = roll(0, arguments.balls), torch.Generator().manual_seed(1)

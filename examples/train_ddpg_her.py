@@ -13,7 +13,7 @@ from torchrl.modules import AdditiveGaussianModule, ValueOperator
 from torchrl.objectives import DDPGLoss, SoftUpdate
 
 from torchdyn_plan.envs import TrapperGoalEnv
-from torchdyn_plan.envs.rewards import goal_reward
+from torchdyn_plan.envs.trapper.reward import goal_reward
 from torchdyn_plan.nets import Actor, Critic, PolicyConfig
 from torchdyn_plan.training.hindsight import HindsightReplayBuffer
 
@@ -52,9 +52,12 @@ replay = HindsightReplayBuffer(reward, capacity=500_000, length=LENGTH, batch_si
 noise = AdditiveGaussianModule(env.action_spec, sigma_init=0.2, sigma_end=0.2)
 frames = arguments.num_envs * LENGTH
 collector = Collector(
-    env, TensorDictSequential(policy, noise), frames_per_batch=frames, total_frames=arguments.rounds * frames,
+    env,
+    TensorDictSequential(policy, noise),
+    frames_per_batch=frames,
+    total_frames=arguments.rounds * frames,
     init_random_frames=2 * frames,
-)  # fmt: skip
+)
 
 for number, episodes in enumerate(collector):
     replay.extend_episodes(episodes.select(*SEEN, "action", *(("next", key) for key in AFTER)))

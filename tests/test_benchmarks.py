@@ -1,5 +1,6 @@
 """Every script in ``benchmarks`` runs, on next to nothing, and writes what it measured beside versions and machine."""
 
+import importlib
 import importlib.util
 import json
 import subprocess
@@ -10,20 +11,26 @@ import pytest
 
 BENCHMARKS = Path(__file__).parent.parent / "benchmarks"
 SMALL = {
-    "ablation": "--velocities 3 --episodes 4 --num-envs 4 --split dev",
+    "ablation": "--velocities 3 --episodes 2 --num-envs 2 --split dev",
     "calibration": "--episodes 8 --pursuit-episodes 8 --split dev",
     "ceiling": "--velocities 5 --episodes 3 --spacing 60 --meetings 1 --leads 7 --rows 64 --split dev",
-    "forecast_gain": "--episodes 4 --seeds 0",
+    "count_calls": "--planners corner --batch 2",
+    "diagnose": "--velocities 3 --episodes 4 --arrivals network --split dev",
+    "forecast_gain": "--episodes 2 --seeds 0 --velocity 5",
+    "former_latency": "--former . --planners corner --statics ik --rounds 1 --seconds 0.01 --calls plan",
     "joint_speeds": "--episodes 4 --num-envs 4",
-    "latency": "--velocities 3 --episodes 4 --latencies 0 20 --unaware 20",
+    "latency": "--velocities 5 --episodes 2 --latencies 0 20 --not-compensated 20",
     "reach_ceiling": "--velocities 0.03 --episodes 8 --other-velocities 0.03 --other-episodes 8 --bounds-alone",
     "reach_env": "--copies 2 --steps 4 --threads 1",
-    "recovery": "--planners meet --statics ik --velocities 3 --episodes 4 --split dev",
-    "schedules": "--planners meet --velocities 3 --schedules paper --episodes 4",
+    "recovery": "--planners wait_and_drop --statics ik --velocities 5 --episodes 2 --num-envs 2 --split dev",
+    "schedules": "--planners wait_and_drop --velocities 3 --schedules paper --episodes 4",
     "static_task": "--episodes 8 --split dev",
 }
-ELSEWHERE = {"diagnose", "killed_training", "measure_arrivals", "policy_curves", "policy_peers"}
-"""Minutes at the least, a picture of trainings, or what the package's own arrival map is made by."""
+ELSEWHERE = {"killed_training", "measure_arrivals", "policy_curves", "policy_peers", "same_episodes"}
+"""Minutes at the least, a picture of trainings, what the package's own arrival map is made by, or a comparison of
+files."""
+PARTS = {"former_latency_side", "study"}
+"""No scripts of their own."""
 
 
 @pytest.mark.parametrize("name", SMALL)
@@ -46,5 +53,49 @@ def test_benchmark_runs(name, tmp_path):
     assert len(figures["rows"]) > 0
 
 
+@pytest.fixture
+def study(monkeypatch):
+    monkeypatch.syspath_prepend(BENCHMARKS)
+    return importlib.import_module("study")
+
+
+def test_a_killed_study_goes_on_with_the_rows_in_its_file(study, tmp_path):
+    arguments, measured = study.Output(out=tmp_path / "figures.json"), []
+
+    def measure():
+        measured.append(0)
+        return {"value": float("nan"), "lost": [1]}
+
+    for case in (1, 2, 1):
+        study.Study(arguments, scene="here").row({"case": case}, measure)
+    assert len(measured) == 2
+    content = json.loads(arguments.out.read_text())
+    assert content["rows"] == [{"case": case, "value": None, "lost": [1]} for case in (1, 2)]
+    assert content.keys() == {"machine", "versions", "scene", "config", "rows"}
+    with pytest.raises(SystemExit, match="holds rows of the scene here, not of there"):
+        study.Study(arguments, scene="there")
+    assert study.Study(arguments, scene="there", resume=False).rows == []
+
+
+def test_a_row_is_saved_before_it_is_printed(study, tmp_path, monkeypatch):
+    arguments = study.Output(out=tmp_path / "figures.json")
+
+    def closed(*_):
+        raise BrokenPipeError
+
+    monkeypatch.setattr(study.tqdm, "write", closed)
+    with pytest.raises(BrokenPipeError):
+        study.Study(arguments).row({"case": 1}, dict)
+    assert json.loads(arguments.out.read_text())["rows"] == [{"case": 1}]
+
+
+def test_changes_are_paired(study):
+    before, after = ({"solvable": 10, "lost": lost} for lost in ([1, 2, 3], [2, 7]))
+    assert study.change_entries(before, after)["change"] == pytest.approx(0.1)
+    low, high = study.change_entries(before, after)["change_ci"]
+    assert low < 0.1 < high
+    assert study.change_entries(before, before)["change"] == 0.0
+
+
 def test_no_benchmark_is_forgotten():
-    assert {file.stem for file in BENCHMARKS.glob("*.py")} == SMALL.keys() | ELSEWHERE
+    assert {file.stem for file in BENCHMARKS.glob("*.py")} == SMALL.keys() | ELSEWHERE | PARTS

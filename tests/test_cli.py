@@ -1,23 +1,43 @@
+import dataclasses
 import json
 import os
 import subprocess
 import sys
+from pathlib import Path
 
 import pytest
 import torch
 
-from torchdyn_plan import cli
+from torchdyn_plan import cli, tasks
 from torchdyn_plan.envs import TrapperEnv, TrapperScene
-from torchdyn_plan.evaluation import run
-from torchdyn_plan.evaluation.results import EpisodeOutcomes
-from torchdyn_plan.evaluation.solvability import ArrivalMap
+from torchdyn_plan.evaluation.results import NO_CAUSE, EpisodeOutcomes
+from torchdyn_plan.evaluation.study import Study
 from torchdyn_plan.nets import pretrained
+from torchdyn_plan.tasks.trapper import solvable
+from torchdyn_plan.tasks.trapper.solvable import ArrivalMap
+from torchdyn_plan.tasks.trapper.task import TASK
 
+ROOT = Path(__file__).parent.parent
 ROW = {
-    "planner", "static", "task", "velocity", "friction", "episodes", "success", "success_ci", "solvable",
-    "success_solvable", "success_solvable_ci", "steps_to_trap", "replans", "failures", "episodes_per_second",
-}  # fmt: skip
+    "planner",
+    "static",
+    "task",
+    "settings",
+    "episodes",
+    "success",
+    "success_ci",
+    "solvable",
+    "success_solvable",
+    "success_solvable_ci",
+    "steps_to_success",
+    "replans",
+    "failures",
+    "episodes_per_second",
+    "paper_success",
+    "paper_success_solvable",
+}
 HEAVY = ("torch", "tensordict", "torchrl", "mujoco", "matplotlib", "numpy", "pytorch_kinematics")
+COMMANDS = ("evaluate", "sweep", "collect", "bench")
 
 
 def answer(words, capsys):
@@ -31,11 +51,30 @@ def answer(words, capsys):
     return code, out, err
 
 
-@pytest.mark.parametrize("words", [["--help"], ["evaluate", "--help"], ["train", "--help"]])
+def helped(words, capsys):
+    """What ``--help`` shows, in one line."""
+    code, out, _ = answer([*words, "--help"], capsys)
+    assert code == 0
+    return " ".join(out.replace("│", " ").split())
+
+
+@pytest.mark.parametrize(
+    "words",
+    [
+        [],
+        *([command] for command in COMMANDS),
+        ["evaluate", "--task", "fetch_reach"],
+        ["train"],
+        ["train", "forecaster"],
+        ["train", "policy"],
+        ["train", "dher", "--task", "fetch_reach"],
+    ],
+    ids=" ".join,
+)
 def test_help_answers_without_anything_heavy(words):
     script = (
         "import sys\nfrom torchdyn_plan.cli import main\n"
-        f"try:\n    main({words!r})\nexcept SystemExit as end:\n    assert end.code == 0\n"
+        f"try:\n    main({[*words, '--help']!r})\nexcept SystemExit as end:\n    assert end.code == 0\n"
         f"print('heavy:', [name for name in {HEAVY!r} if name in sys.modules])"
     )
     done = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, check=True)
@@ -44,32 +83,70 @@ def test_help_answers_without_anything_heavy(words):
 
 
 def test_the_installed_command_is_this_one():
-    done = subprocess.run(
-        [sys.executable, "-m", "torchdyn_plan.cli"], capture_output=True, text=True, check=True
-    )  # fmt: skip
-    assert (done.stdout, done.stderr) == ("", "")
     from importlib.metadata import entry_points
 
     (entry,) = entry_points(group="console_scripts", name="torchdyn-plan")
     assert entry.load() is cli.main
 
 
+def test_the_package_runs_as_a_module():
+    run = [sys.executable, "-m", "torchdyn_plan", "--help"]
+    done = subprocess.run(run, capture_output=True, text=True, check=True)
+    assert "usage: torchdyn-plan" in done.stdout
+    assert done.stderr == ""
+
+
+def test_each_task_shows_its_own_options_alone(capsys):
+    trapper, fetch = (helped(["evaluate", "--task", name], capsys) for name in ("trapper", "fetch_reach"))
+    for own, other, words in (
+        (trapper, fetch, ("--friction", "Velocity of the ball at the start [m/s].", "wait_and_drop", "{ik,rl}")),
+        (fetch, trapper, ("--goal-range", "--threshold", "{straight,circle,random}", "dher", "{proportional,rl}")),
+    ):
+        for word in words:
+            assert word in own
+            assert word not in other
+    assert "{velocity,friction}" in helped(["sweep"], capsys)
+    assert "{velocity}" in helped(["sweep", "--task=fetch_reach"], capsys)
+
+
+def test_each_network_shows_its_own_options_alone(capsys):
+    forecaster, policy = (helped(["train", name], capsys) for name in ("forecaster", "policy"))
+    dher = helped(["train", "dher", "--task", "fetch_reach"], capsys)
+    for word in ("--out", "--steps", "--batch", "--lr", "--seed", "--device", "--resume"):
+        assert all(word in shown for shown in (forecaster, policy, dher))
+    for word in ("--num-envs", "--workers", "--threads"):
+        assert word not in forecaster
+        assert word in policy
+        assert word in dher
+    assert "--data" in forecaster
+    assert "--data" not in policy
+    assert "--period" in policy
+    assert "--period" not in dher
+    assert "--velocity" in dher
+    assert "--velocity" not in policy
+    overview = helped(["train"], capsys)
+    assert "dher" not in overview
+    for name in ("forecaster", "spread", "eta", "policy"):
+        assert name in overview
+
+
 BAD = [
-    (["evaluate", "--planners", "pursit"], "unknown planner 'pursit' (did you mean 'pursuit'?)"),
+    (["evaluate", "--planners", "pursit"], "unknown planner of trapper 'pursit' (did you mean 'pursuit'?)"),
     (["evaluate", "--planners", "pursuit", "pursuit"], "planners must be named once each"),
     (["evaluate", "--planners"], "planners must name at least one of"),
-    (["evaluate", "--static", "kuka"], "unknown static planner 'kuka'"),
-    (["evaluate", "--task", "raech"], "unknown task 'raech' (did you mean 'reach'?)"),
-    (["evaluate", "--task", "reach", "--planners", "meet"], "unknown planner 'meet'"),
-    (["evaluate", "--task", "reach", "--velocity", "3"], "velocity must be in [0, 0.2], got 3.0"),
-    (["evaluate", "--task", "reach", "--velocity", "0.01", "--motion", "zigzag"], "unknown motion 'zigzag'"),
-    (["collect", "paths", "--task", "raech"], "unknown task 'raech'"),
-    (["train", "dher"], "dher is trained in reach alone"),
+    (["evaluate", "--static", "kuka"], "unknown static planner of trapper 'kuka'"),
+    (["evaluate", "--task", "fetch_raech"], "unknown task 'fetch_raech' (did you mean 'fetch_reach'?)"),
+    (["evaluate", "--task"], "--task names none; choose from fetch_reach, trapper"),
+    (["evaluate", "--task", "no.such.module:TASK"], "no task at 'no.such.module:TASK': No module named 'no'"),
+    (["evaluate", "--task", "fetch_reach", "--planners", "wait_and_drop"], "unknown planner of fetch_reach"),
+    (["evaluate", "--task", "fetch_reach", "--velocity", "3"], "velocity must be in [0, 0.2], got 3.0"),
+    (["evaluate", "--task", "fetch_reach", "--motion", "zigzag"], "unknown motion 'zigzag'"),
     (["evaluate", "--split", "tets"], "unknown split 'tets' (did you mean 'test'?)"),
     (["evaluate", "--velocity", "-1"], "velocity must be in [0, 20], got -1.0"),
     (["evaluate", "--velocity", "nan"], "velocity must be a finite number, got nan"),
     (["evaluate", "--friction", "-0.5"], "friction must be >= 0, got -0.5"),
     (["evaluate", "--latency-ms", "10"], "latency_ms must be whole control steps of 4 ms, got 10"),
+    (["evaluate", "--task", "fetch_reach", "--latency-ms", "20"], "latency_ms must be whole control steps of 40 ms"),
     (["evaluate", "--latency-ms", "-4"], "latency_ms must be >= 0, got -4.0"),
     (["evaluate", "--episodes", "0"], "episodes must be >= 1, got 0"),
     (["evaluate", "--num-envs", "0"], "num_envs must be >= 1, got 0"),
@@ -77,21 +154,26 @@ BAD = [
     (["evaluate", "--out", "{file}"], "output folder '{file}' is not writable: File exists"),
     (["evaluate", "--out", "{file}/below"], "output folder '{file}/below' is not writable: Not a directory"),
     (["sweep", "--over", "velocity", "--out", "{file}"], "output folder '{file}' is not writable"),
+    (["sweep", "--over", "speed", "--out", "{new}"], "unknown setting of trapper to sweep over 'speed'"),
     (["sweep", "--over", "velocity", "--out", "{new}", "--values", "1", "nan"], "velocity must be a finite number"),
     (["sweep", "--over", "velocity", "--out", "{new}", "--values", "1", "1"], "values must differ, got 1.0 1.0"),
     (["sweep", "--over", "friction", "--out", "{new}", "--values", "-1"], "friction must be >= 0"),
     (["sweep", "--over", "friction", "--out", "{new}", "--repeats", "0"], "repeats must be >= 1"),
+    (["collect", "paths", "--task", "trappr"], "unknown task 'trappr' (did you mean 'trapper'?)"),
+    (["collect", "pahts", "--out", "{out}"], "unknown kind of data 'pahts' (did you mean 'paths'?)"),
     (["collect", "paths", "--out", "{file}"], "output folder '{file}' is not writable"),
-    (["collect", "arrivals", "--static", "kuka"], "unknown static planner 'kuka'"),
+    (["collect", "arrivals", "--static", "kuka", "--out", "{out}"], "unknown static planner of trapper 'kuka'"),
+    (["collect", "arrivals", "--weights", "{new}", "--out", "{out}"], "no weights '{new}'"),
+    (["train", "dher"], "unknown network of trapper 'dher'; choose from eta, forecaster, policy, spread"),
     (["train", "eta", "--data", "{new}", "--out", "{out}"], "no arrivals-*.json in '{new}'"),
     (["train", "forecaster", "--data", "{new}", "--out", "{out}"], "no paths-*.json in '{new}'"),
+    (["train", "spread", "--task", "fetch_reach", "--out", "{out}"], "fetch_reach"),
     (["train", "eta", "--out", "{file}"], "output folder '{file}' is not writable"),
-    (["train", "eta", "--lr", "nan"], "lr must be a finite number, got nan"),
+    (["train", "eta", "--lr", "nan", "--out", "{out}"], "lr must be a finite number, got nan"),
     (["train", "eta", "--device", "gpu", "--data", "{new}", "--out", "{out}"], "device 'gpu' cannot be used"),
-    (["collect", "arrivals", "--weights", "{new}"], "weights are of a policy"),
-    (["collect", "arrivals", "--static", "rl", "--weights", "{new}", "--out", "{out}"], "no policy at '{new}'"),
-    (["train", "policy", "--num-envs", "0"], "num_envs must be >= 1, got 0"),
-    (["train", "policy", "--period", "0"], "period must be >= 1, got 0"),
+    (["train", "policy", "--num-envs", "0", "--out", "{out}"], "num_envs must be >= 1, got 0"),
+    (["train", "policy", "--period", "0", "--out", "{out}"], "period must be >= 1, got 0"),
+    (["train", "dher", "--task", "fetch_reach", "--velocity", "1", "--out", "{out}"], "velocity must be in [0, 0.2]"),
     (["train", "policy", "--out", "{file}"], "output folder '{file}' is not writable"),
     (["train", "policy", "--device", "gpu", "--out", "{out}"], "device 'gpu' cannot be used"),
     (
@@ -134,8 +216,12 @@ def test_weights_that_are_missing_are_named_before_anything_runs(tmp_path, monke
 def quick(monkeypatch):
     """Short episodes, and a map that says that the arm is everywhere after 40 steps."""
     everywhere = ArrivalMap(torch.full((3, 3), 40), TrapperScene().half_side)
-    monkeypatch.setattr(run, "arrival_map", lambda *_, **__: everywhere)
-    monkeypatch.setattr(run, "TrapperEnv", lambda *args, **settings: TrapperEnv(*args, max_steps=130, **settings))
+    monkeypatch.setattr(solvable, "arrival_map", lambda *_, **__: everywhere)
+
+    def make_env(settings, **batch):
+        return TrapperEnv(velocity=settings.velocity, friction=settings.friction, max_steps=130, **batch)
+
+    monkeypatch.setitem(tasks.task._registered, "trapper", dataclasses.replace(TASK, make_env=make_env))
 
 
 @pytest.mark.usefixtures("quick")
@@ -144,15 +230,17 @@ def test_evaluate_prints_a_table_and_writes_everything(tmp_path, capsys):
     code, out, _ = answer([*words, "--split", "dev", "--out", tmp_path / "new" / "run"], capsys)
     assert code == 0
     assert "pursuit" in out
+    assert "steps to trap" in out
     folder = tmp_path / "new" / "run"
     assert sorted(path.name for path in folder.iterdir()) == ["episodes.json", "results.json", "results.png"]
     results = json.loads((folder / "results.json").read_text())
     assert set(results) == {"config", "versions", "machine", "rows"}
-    config = {"planners": ["pursuit"], "velocity": 0.5, "friction": 0.0, "episodes": 16, "seed": 0, "split": "dev"}
+    config = {"task": "trapper", "planners": ["pursuit"], "episodes": 16, "seed": 0, "split": "dev"}
+    config["settings"] = {"velocity": 0.5, "friction": 0.0}
     assert config.items() <= results["config"].items()
     assert results["config"]["scene"] == TrapperScene().digest()
     (row,) = results["rows"]
-    assert set(row) >= ROW
+    assert set(row) == ROW
     low, high = row["success_ci"]
     assert 0 <= low <= row["success"] <= high <= 1
     assert 0 < row["solvable"] <= 1
@@ -164,25 +252,49 @@ def test_evaluate_prints_a_table_and_writes_everything(tmp_path, capsys):
     assert (folder / "results.png").read_bytes().startswith(b"\x89PNG")
 
 
-def outcome(arguments):
+@pytest.mark.usefixtures("quick")
+def test_a_task_of_another_module_is_found_from_the_working_folder(tmp_path, capsys):
+    words = ["evaluate", "--task", "tests.evaluation.toy_task:TASK", "--drift", 0.02, "--episodes", 8, "--threads", 1]
+    code, out, err = answer([*words, "--out", tmp_path], capsys)
+    assert code == 0, err
+    assert "steps to catch" in out
+    assert "drift 0.02 m a step" in out
+    assert json.loads((tmp_path / "results.json").read_text())["config"]["task"] == "drift"
+    shown = helped(["evaluate", "--task", "tests.evaluation.toy_task:TASK"], capsys)
+    assert "How far the point drifts [m a step]. (default: 0.01)" in shown
+    code, _, err = answer(["train", "forecaster", "--task", "tests.evaluation.toy_task:TASK"], capsys)
+    assert (code, err) == (2, "torchdyn-plan: error: drift has no network to train\n")
+
+
+def outcome(settings, seed):
     """An outcome that depends on the setting alone."""
-    random = torch.Generator().manual_seed(int(10 * arguments.velocity) + arguments.seed)
-    flags = {name: torch.rand(4, generator=random) < 0.5 for name in ("trapped", "touched", "pocketed", "solvable")}
-    steps = torch.where(flags["trapped"], 90, -1)
-    return {"pursuit": EpisodeOutcomes(**flags, steps=steps, replans=torch.zeros(4, dtype=torch.int64), seconds=1.0)}
+    random = torch.Generator().manual_seed(int(10 * settings.velocity) + seed)
+    success, solvable, pocketed = (torch.rand(4, generator=random) < 0.5 for _ in range(3))
+    return {
+        "pursuit": EpisodeOutcomes(
+            success=success,
+            steps=torch.where(success, 90, -1),
+            replans=torch.zeros(4, dtype=torch.int64),
+            solvable=solvable,
+            flags={"pocketed": pocketed},
+            cause=torch.where(success, NO_CAUSE, 0),
+            causes=TASK.causes,
+            seconds=1.0,
+        )
+    }
 
 
 def test_a_killed_sweep_continues_and_ends_as_one_that_was_not(tmp_path, monkeypatch, capsys):
     ran = []
 
-    def run_points(arguments):
+    def run(self, settings, seed):
         if len(ran) == 3 and None not in ran:
             ran.append(None)
             raise KeyboardInterrupt
-        ran.append((arguments.velocity, arguments.seed))
-        return outcome(arguments)
+        ran.append((settings.velocity, seed))
+        return outcome(settings, seed)
 
-    monkeypatch.setattr(run, "run_points", run_points)
+    monkeypatch.setattr(Study, "run", run)
     words = ["sweep", "--over", "velocity", "--planners", "pursuit", "--values", 0, 1.5, "--repeats", 2]
     words += ["--episodes", 4, "--seed", 5, "--out"]
     code, _, err = answer([*words, tmp_path / "killed"], capsys)
@@ -196,7 +308,7 @@ def test_a_killed_sweep_continues_and_ends_as_one_that_was_not(tmp_path, monkeyp
     assert answer([*words, tmp_path / "whole"], capsys)[0] == 0
     one, other = (json.loads((tmp_path / name / "results.json").read_text()) for name in ("killed", "whole"))
     assert one["rows"] == other["rows"]
-    assert [(row["velocity"], row["episodes"]) for row in one["rows"]] == [(0.0, 8), (1.5, 8)]
+    assert [(row["settings"]["velocity"], row["episodes"]) for row in one["rows"]] == [(0.0, 8), (1.5, 8)]
     code, _, err = answer([*words, tmp_path / "killed", "--friction", "1"], capsys)
     assert code == 2
     assert "holds a sweep with another configuration: friction is 0.0 there, 1.0 here" in err
@@ -206,8 +318,10 @@ def test_results_are_saved_though_nobody_reads_the_table(tmp_path):
     words = f"evaluate --planners pursuit --episodes 2 --num-envs 2 --split dev --threads 1 --out {tmp_path}".split()
     run = subprocess.Popen(
         [sys.executable, "-c", "from torchdyn_plan.cli import main; main()", *words],
-        stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True,
-    )  # fmt: skip
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
+    )
     run.stdout.close()
     errors = run.stderr.read()
     assert run.wait(120) == 0, errors
@@ -221,8 +335,11 @@ def test_a_terminal_without_our_signs_still_gets_the_table(tmp_path, encoding):
     words = f"evaluate --planners pursuit --episodes 2 --num-envs 2 --split dev --threads 1 --out {tmp_path}".split()
     run = subprocess.run(
         [sys.executable, "-c", "from torchdyn_plan.cli import main; main()", *words],
-        env={**os.environ, "PYTHONIOENCODING": encoding}, capture_output=True, check=False, timeout=120,
-    )  # fmt: skip
+        env={**os.environ, "PYTHONIOENCODING": encoding},
+        capture_output=True,
+        check=False,
+        timeout=120,
+    )
     assert run.returncode == 0, run.stderr
     assert b"pursuit" in run.stdout
     assert (tmp_path / "results.json").is_file()

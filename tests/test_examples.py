@@ -10,11 +10,11 @@ EXAMPLES = Path(__file__).parent.parent / "examples"
 @pytest.mark.parametrize(
     ("name", "says"),
     [
-        ("01_trap_a_ball.py", "DynamicPlanner  traps"),
+        ("01_trap_a_ball.py", "ours        traps"),
         ("02_own_static_planner.py", "target 0.0"),
         ("04_place_the_base.py", "40 of 40 goals reached"),
         ("train_ddpg_her.py --rounds 2 --num-envs 2 --updates 2", "round    2: mean reward"),
-        ("06_any_planner.py", "meet     mj_jac"),
+        ("06_any_planner.py", "wait_and_drop, mj_jac"),
         ("05_real_time_loop.py", "plans came into use"),
         ("07_fine_tune_forecaster.py", "after: miss 0.0"),
     ],
@@ -35,4 +35,6 @@ def test_example_runs(name, says, tmp_path):
 
 def test_examples_are_short():
     for file in EXAMPLES.glob("*.py"):
-        assert len(file.read_text().splitlines()) <= 80, file.name
+        # A whole task is longer; tests/test_own_task.py runs it.
+        longest = 120 if file.name == "own_task.py" else 80
+        assert len(file.read_text().splitlines()) <= longest, file.name

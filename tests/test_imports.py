@@ -9,16 +9,29 @@ import pytest
 import torchdyn_plan
 
 ROOT = Path(torchdyn_plan.__file__).parent
-WORDS = {"errors", "checks", "files", "keys"}
+WORDS = {"errors", "checks", "files", "keys", "threads"}
+"""What everything may use."""
+MODELS = WORDS | {"versions", "kinematics", "nets", "planners"}
+STUDIES = MODELS | {"envs", "tasks"}
+"""What training, evaluation and benchmarks may use: of envs and tasks the general modules, see below."""
 MAY_IMPORT = {
     **dict.fromkeys(sorted(WORDS), WORDS),
     "versions": set(),
     "kinematics": WORDS,
     "nets": WORDS | {"kinematics"},
-    "planners": WORDS | {"kinematics", "nets"},
+    "planners": WORDS | {"kinematics", "nets", "versions"},
     "envs": WORDS | {"kinematics"},
+    "tasks": STUDIES | {"training", "evaluation"},
+    "training": STUDIES,
+    "evaluation": STUDIES,
+    "bench": STUDIES | {"evaluation"},
+    "cli": STUDIES | {"training", "evaluation", "bench"},
 }
+TASKS = sorted(folder.name for folder in (ROOT / "tasks").iterdir() if (folder / "task.py").is_file())
+FACES = {ROOT / "envs" / "__init__.py", ROOT / "tasks" / "__init__.py"}
+"""Modules that say where the environments of tasks are, and which task commands take that name none."""
 SIMULATION = {"torchrl", "mujoco", "matplotlib"}
+HEAVY = SIMULATION | {"pytorch_kinematics", "torch", "tensordict", "numpy"}
 
 
 def imports(tree: ast.AST, *, only_at_import: bool = False) -> Iterator[str]:
@@ -39,6 +52,16 @@ def is_skipped_at_import(node: ast.AST) -> bool:
     return isinstance(node, ast.FunctionDef | ast.AsyncFunctionDef)
 
 
+def without_primer(tree: ast.Module) -> ast.Module:
+    """``tree`` without `make_tensordict_primer`, which is for those who have TorchRL."""
+    for node in ast.walk(tree):
+        if isinstance(node, ast.ClassDef):
+            node.body = [one for one in node.body if getattr(one, "name", "") != "make_tensordict_primer"] or [
+                ast.Pass()
+            ]
+    return tree
+
+
 def files_of(part: str) -> list[Path]:
     return sorted((ROOT / part).rglob("*.py")) if (ROOT / part).is_dir() else [ROOT / f"{part}.py"]
 
@@ -55,10 +78,53 @@ def test_imports_run_downwards_only(part):
         assert used <= MAY_IMPORT[part], f"{file.relative_to(ROOT)} imports {used - MAY_IMPORT[part]}"
 
 
+def general_files() -> list[Path]:
+    """Modules that know no task."""
+    own = [ROOT / room / task for room in ("envs", "tasks") for task in TASKS]
+    files = [file for file in ROOT.rglob("*.py") if not any(folder in file.parents for folder in own)]
+    return sorted(set(files) - FACES)
+
+
+def names_of_tasks() -> set[str]:
+    """Names of tasks, and of the classes and constants that their folders define."""
+    found = set(TASKS)
+    for room in ("envs", "tasks"):
+        for task in TASKS:
+            for file in (ROOT / room / task).rglob("*.py"):
+                for node in ast.parse(file.read_text()).body:
+                    if isinstance(node, ast.ClassDef):
+                        found.add(node.name)
+    return found
+
+
+def test_there_are_tasks_and_names_to_look_for():
+    assert TASKS == ["fetch_reach", "trapper"]
+    assert names_of_tasks() > {"TrapperScene", "WaitAndDrop", "DynamicReachEnv", "BoxApproach", "trapper"}
+    assert len(general_files()) > 60
+
+
+@pytest.mark.parametrize("file", general_files(), ids=lambda file: str(file.relative_to(ROOT)))
+def test_general_modules_know_no_task(file):
+    tree, names = ast.parse(file.read_text()), names_of_tasks()
+    for name in imports(tree):
+        assert not any(f".{task}" in name for task in TASKS), f"imports {name}"
+        assert own_part(name) != "cli" or ROOT / "cli" in file.parents or file == ROOT / "__main__.py", (
+            f"imports {name}"
+        )
+    for node in ast.walk(tree):
+        if isinstance(node, ast.Name | ast.Attribute):
+            word = node.id if isinstance(node, ast.Name) else node.attr
+            assert word not in names, f"line {node.lineno} names {word}"
+        if isinstance(node, ast.Constant) and isinstance(node.value, str):
+            text = node.value.lower()
+            said = [task for task in TASKS if task in text]
+            assert not said, f"line {node.lineno} says {said[0]}"
+
+
 @pytest.mark.parametrize("part", ["kinematics", "nets", "planners"])
 def test_planners_and_below_know_no_simulation(part):
     for file in files_of(part):
-        used = {name.split(".")[0] for name in imports(ast.parse(file.read_text()))}
+        used = {name.split(".")[0] for name in imports(without_primer(ast.parse(file.read_text())))}
         assert not used & SIMULATION, f"{file.relative_to(ROOT)} imports {used & SIMULATION}"
 
 
@@ -81,7 +147,9 @@ def test_the_walk_sees_imports_at_both_levels():
     ("statement", "absent"),
     [
         ("import torchdyn_plan.planners", SIMULATION | {"pytorch_kinematics"}),
-        ("import torchdyn_plan.cli", SIMULATION | {"pytorch_kinematics", "torch", "tensordict", "tyro", "numpy"}),
+        ("import torchdyn_plan.cli", HEAVY | {"tyro"}),
+        ("import torchdyn_plan.tasks; torchdyn_plan.tasks.load_task('trapper')", HEAVY),
+        ("import torchdyn_plan; dir(torchdyn_plan); torchdyn_plan.load_task", HEAVY),
     ],
 )
 def test_importing_stays_light(statement, absent):

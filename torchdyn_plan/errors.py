@@ -23,7 +23,3 @@ class TrainingError(TorchdynPlanError, RuntimeError):
 
 class CompileError(TorchdynPlanError, RuntimeError):
     """Something cannot be compiled on this machine."""
-
-
-class UsageError(TorchdynPlanError):
-    """An argument of a command is wrong."""

@@ -1,11 +1,13 @@
-"""The tensordict keys that environments, planners and training share, in one table."""
+"""The tensordict keys that environments, planners and training share, in one table.
+
+Keys of one task alone stand beside its environment.
+"""
 
 from dataclasses import dataclass
 
 JOINT_POS = "joint_pos"
 JOINT_VEL = "joint_vel"
 TOOL_POS = "tool_pos"
-TOOL_ROTATION = "tool_rotation"
 TARGET_POS = "target_pos"
 TARGET_HISTORY = "target_history"
 HISTORY_LENGTH = "history_length"
@@ -18,9 +20,6 @@ STEP_COUNT = "step_count"
 GOAL = "goal"
 ARRIVAL_STEPS = "arrival_steps"
 ACTION = "action"
-TRAPPED = "trapped"
-POCKETED = "pocketed"
-REACHED = "reached"
 EPISODE = "episode"
 PLAN = "plan"
 
@@ -39,8 +38,7 @@ class Key:
 KEYS: tuple[Key, ...] = (
     Key(name=JOINT_POS, shape=("N",), meaning="joint angles [rad]", writer="env"),
     Key(name=JOINT_VEL, shape=("N",), meaning="joint speeds [rad/s]", writer="env"),
-    Key(name=TOOL_POS, shape=(3,), meaning="centre of the box mouth [m, world]", writer="env"),
-    Key(name=TOOL_ROTATION, shape=(3, 3), meaning="the box's axes in the world, as columns", writer="goal env"),
+    Key(name=TOOL_POS, shape=(3,), meaning="place of the tool [m, world]", writer="env"),
     Key(name=TARGET_POS, shape=(3,), meaning="centre of the target [m, world]", writer="env"),
     Key(name=TARGET_HISTORY, shape=("H", 3), meaning="target positions, oldest first [m, world]", writer="env"),
     Key(name=HISTORY_LENGTH, shape=(), meaning="samples in the history that are no padding", writer="env"),
@@ -49,13 +47,10 @@ KEYS: tuple[Key, ...] = (
     Key(name=ACHIEVED_GOAL, shape=(3,), meaning="tool position under Gymnasium's name [m, world]", writer="env"),
     Key(name=DESIRED_GOAL, shape=(3,), meaning="place to reach [m, world]", writer="env"),
     Key(name=STEP_COUNT, shape=(), meaning="control steps since the reset", writer="env"),
-    Key(name=TRAPPED, shape=(1,), meaning="the target is covered and kept", writer="env"),
-    Key(name=POCKETED, shape=(1,), meaning="the target fell into a pocket", writer="env"),
-    Key(name=REACHED, shape=(1,), meaning="the tool has been at the target in this episode", writer="reach env"),
     Key(name=EPISODE, shape=(), meaning="index of the episode within its split and seed", writer="env"),
     Key(name=GOAL, shape=(3,), meaning="place the static planner is sent to [m, world]", writer="planner"),
     Key(name=ARRIVAL_STEPS, shape=(), meaning="control steps from now to the meeting", writer="planner"),
-    Key(name=ACTION, shape=("A",), meaning="joint speed as a fraction of the limit, -1 to 1", writer="static planner"),
+    Key(name=ACTION, shape=("A",), meaning="what the robot is told to do, each entry -1 to 1", writer="static planner"),
     Key(name=TARGET_FUTURE, shape=("F", 3), meaning="recorded truth, for the oracle [m, world]", writer="evaluation"),
     Key(name=PLAN, shape=(), meaning="the planner's memory between steps (nested)", writer="planner"),
 )

@@ -4,11 +4,10 @@ import pytest
 import torch
 
 from tests.evaluation.untrained import untrained
-from torchdyn_plan.cli_arguments import CONTROL_STEP_MS, EvaluateArguments
 from torchdyn_plan.envs import TrapperEnv, TrapperScene
-from torchdyn_plan.evaluation import run
-from torchdyn_plan.evaluation.latency import delay_plans
-from torchdyn_plan.planners import CallablePlanner, IKPlanner, ReplanSchedule, TargetPursuit
+from torchdyn_plan.evaluation.study import Study
+from torchdyn_plan.planners import Delayed, ReplanSchedule, TargetPursuit
+from torchdyn_plan.tasks.trapper.task import TASK, ik_planner
 
 SCHEDULE = ReplanSchedule(first_step=3, window=7, minimum=5)
 
@@ -18,36 +17,36 @@ def goals(planner, steps=16):
         return TrapperEnv(2, num_threads=1).rollout(steps, planner, break_when_any_done=False)["goal"]
 
 
-@pytest.mark.parametrize("told", [True, False])
-def test_plans_come_late_and_only_who_is_told_plans_for_it(told):
-    plain, late = untrained(schedule=SCHEDULE), delay_plans(untrained(schedule=SCHEDULE), 2, told=told)
-    assert late.latency == (2 if told else 0)
+def delivered(planner, delivery):
+    return Study.of(TASK, {"mine": planner}, delivery=delivery).planners["mine"]
+
+
+@pytest.mark.parametrize("compensate", [True, False])
+def test_plans_come_late_and_only_who_is_told_plans_for_it(compensate):
+    plain = untrained(schedule=SCHEDULE)
+    late = delivered(plain, Delayed(2, compensate=compensate))
+    assert late.delivery.delay == (2 if compensate else 0)
     expected, got = goals(plain), goals(late)
     assert torch.equal(got[:, :5], expected[:, :1].expand(-1, 5, -1))
     assert not torch.equal(got[:, 5], got[:, 4])
-    if not told:
+    if not compensate:
         assert torch.equal(got[:, 5], expected[:, 3])
 
 
 def test_no_latency_and_planners_that_plan_nothing_are_left_alone():
     planner = untrained()
-    assert delay_plans(planner, 0, told=True).delivery is planner.delivery
-    pursuit = TargetPursuit(IKPlanner())
-    assert delay_plans(pursuit, 5, told=True) is pursuit
+    assert delivered(planner, None) is planner
+    pursuit = TargetPursuit(ik_planner())
+    assert delivered(pursuit, Delayed(5)) is pursuit
 
 
 def test_a_control_step_is_the_scenes():
-    assert math.isclose(CONTROL_STEP_MS / 1000, TrapperScene().control_step)
-    assert EvaluateArguments(latency_ms=36).latency_steps == 9
+    assert math.isclose(TASK.control_step, TrapperScene().control_step)
 
 
-def test_evaluate_delays_the_planners_that_it_runs(monkeypatch):
-    still = CallablePlanner(lambda state, goal: torch.zeros(*goal.shape[:-1], 6))
-    planner = untrained()
-    planner.static = still
-    monkeypatch.setitem(run.PLANNERS, "corner", lambda static, task: planner)
-    monkeypatch.setattr(run, "record_truth", lambda arguments: (torch.zeros(1, 9, 3), torch.ones(1, dtype=torch.bool)))
-    monkeypatch.setattr(run, "run_episodes", lambda planner, *others: (planner.latency, planner.delivery.steps))
-    for compensate in (True, False):
-        arguments = EvaluateArguments(planners=("corner",), latency_ms=20, compensate=compensate)
-        assert run.run_points(arguments) == {"corner": (5 if compensate else 0, 5)}
+@pytest.mark.parametrize("compensate", [True, False])
+def test_planners_that_are_named_are_delayed_too(compensate):
+    delivery = Delayed(5, compensate=compensate)
+    study = Study.of(TASK, ["corner", "pursuit"], delivery=delivery)
+    assert study.planners["corner"].delivery == delivery
+    assert study.config()["delivery"] == f"Delayed(steps=5, compensate={compensate})"

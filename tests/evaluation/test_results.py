@@ -1,44 +1,74 @@
+import dataclasses
 import json
-from dataclasses import replace
-from pathlib import Path
 
 import pytest
 import torch
 
-from torchdyn_plan.evaluation.evidence import Evidence
+from torchdyn_plan.errors import InputError
 from torchdyn_plan.evaluation.plots import plot_results, plot_sweep
 from torchdyn_plan.evaluation.report import format_table
-from torchdyn_plan.evaluation.results import EpisodeOutcomes, ResultRow, summarize
+from torchdyn_plan.evaluation.results import NO_CAUSE, EpisodeOutcomes, failure_shares, summarize
+from torchdyn_plan.tasks.trapper.task import TASK, TrapperSettings
 
-RESULTS = Path(__file__).parents[2] / "benchmarks" / "results"
-PUBLISHED = [RESULTS / name / "results.json" for name in ("friction", "velocity")]
+CAUSES = TASK.causes
 
 
 def outcomes(count=6, seed=0):
     random = torch.Generator().manual_seed(seed)
-    flags = [torch.rand(count, generator=random) < 0.5 for _ in range(7)]
-    clues = Evidence(
-        flags[4], flags[4] & flags[5], 0.1 * torch.rand(count, generator=random),
-        torch.randint(-20, 20, (count,), generator=random), torch.where(flags[1], 7, -1), flags[6],
-    )  # fmt: skip
-    named = dict(zip(("trapped", "touched", "pocketed", "solvable"), flags[:4], strict=True))
-    steps = torch.where(flags[0], 90, -1)
-    return EpisodeOutcomes(**named, steps=steps, replans=steps.clamp_min(3), seconds=1.5, evidence=clues)
+    success, solvable, touched, pocketed, promised = (torch.rand(count, generator=random) < 0.5 for _ in range(5))
+    cause = torch.randint(len(CAUSES), (count,), generator=random).masked_fill(success, NO_CAUSE)
+    return EpisodeOutcomes(
+        success=success,
+        steps=torch.where(success, 90, -1),
+        replans=torch.arange(count),
+        solvable=solvable,
+        flags={"pocketed": pocketed, "touched": touched},
+        evidence={"promised": promised, "forecast_error": 0.1 * torch.rand(count, generator=random)},
+        cause=cause,
+        causes=CAUSES,
+        seconds=1.5,
+    )
 
 
-def assert_same(one, other):
-    for name in ("trapped", "touched", "pocketed", "solvable", "steps", "replans", "cause"):
-        assert torch.equal(getattr(one, name), getattr(other, name)), name
-    for clue, same in zip(one.evidence, other.evidence, strict=True):
-        assert clue.dtype == same.dtype
-        assert torch.equal(clue, same)
+def row(episodes=None, planner="corner", **settings):
+    return summarize(
+        episodes or outcomes(), task=TASK, planner=planner, static="ik", settings=TrapperSettings(**settings)
+    )
 
 
 def test_outcomes_survive_a_file():
     before = outcomes()
-    content = json.loads(json.dumps(before.to_json(), allow_nan=False))
-    assert_same(EpisodeOutcomes.from_json(content), before)
+    content = json.loads(json.dumps(before.to_json(TASK), allow_nan=False))
+    after = EpisodeOutcomes.from_json(content, TASK)
+    for name in ("success", "steps", "replans", "solvable", "cause"):
+        one, other = getattr(before, name), getattr(after, name)
+        assert one.dtype == other.dtype
+        assert torch.equal(one, other), name
+    again = after.to_json(TASK)
+    assert again == content
     assert {name is None for name in content["cause"]} == {True, False}
+
+
+def test_files_speak_the_tasks_words():
+    content = outcomes().to_json(TASK)
+    names = {"trapped", "steps", "replans", "solvable", "touched", "pocketed", "promised", "forecast_error"}
+    assert set(content) == names | {"cause", "seconds"}
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        (lambda content: content.pop("trapped"), "episode outcomes lack trapped"),
+        (lambda content: content.update(cause=["rain"] * 6), "name unknown causes: rain"),
+        (lambda content: content.update(steps=[1, 2]), r"outcomes.steps must have shape \(E,\) = \(6,\), got \(2,\)"),
+        (lambda content: content.update(solvable=[1] * 6), "outcomes.solvable must be bool"),
+    ],
+)
+def test_a_damaged_file_is_refused(change, message):
+    content = outcomes().to_json(TASK)
+    change(content)
+    with pytest.raises(InputError, match=message):
+        EpisodeOutcomes.from_json(content, TASK)
 
 
 def test_merged_outcomes_are_one_run():
@@ -46,27 +76,51 @@ def test_merged_outcomes_are_one_run():
     both = EpisodeOutcomes.merge(parts)
     assert both.seconds == 3.0
     assert both.cause.tolist() == [code for part in parts for code in part.cause.tolist()]
+    for name in ("pocketed", "touched"):
+        assert torch.equal(both.flags[name], torch.cat([part.flags[name] for part in parts]))
+    assert torch.equal(both.evidence["promised"], torch.cat([part.evidence["promised"] for part in parts]))
 
 
-def test_outcomes_of_before_there_was_evidence_are_read():
-    content = outcomes().to_json()
-    old = {name: values for name, values in content.items() if name not in {*Evidence._fields, "cause"}}
-    assert_same(EpisodeOutcomes.from_json(old), replace(outcomes(), evidence=Evidence.none(6)))
+def test_shares_are_of_all_episodes():
+    late, early = CAUSES.index("late"), CAUSES.index("early_contact")
+    codes = torch.tensor([NO_CAUSE, NO_CAUSE, 0, early, early, late, NO_CAUSE, late])
+    found = dataclasses.replace(outcomes(8), cause=codes)
+    expected = dict.fromkeys(CAUSES, 0.0) | {"unreachable": 1 / 8, "early_contact": 2 / 8, "late": 2 / 8}
+    assert failure_shares(found) == expected
 
 
-@pytest.mark.parametrize("path", PUBLISHED, ids=lambda path: path.parent.name)
-def test_published_results_are_read_whatever_their_causes(path, tmp_path):
-    rows = [ResultRow(**row) for row in json.loads(path.read_text())["rows"]]
-    table = format_table(rows)
-    for name in rows[0].failures:
-        assert name.replace("_", " ") in table
-    plot_sweep(rows, path.parent.name, tmp_path / "sweep.png")
-    plot_results(rows[:1], tmp_path / "results.png")
+def test_shares_and_success_add_up():
+    found = outcomes(1000)
+    assert sum(failure_shares(found).values()) + found.success.double().mean().item() == pytest.approx(1.0)
 
 
-def test_a_table_of_old_and_new_results_has_all_their_causes():
-    new = summarize(outcomes(), planner="meet", static="ik", velocity=3.0, friction=0.0)
-    table = format_table([new, replace(new, failures={"too_early": 0.25})])
-    head = table.splitlines()[2]
-    assert head.index("unreachable") < head.index("late") < head.index("too early")
-    assert table.splitlines()[-1].endswith("25 %")
+def test_a_table_names_what_rows_share_and_what_tells_them_apart():
+    alone = format_table(TASK, [row(), row(planner="pursuit")])
+    title, _, head, *_ = alone.splitlines()
+    assert title.startswith("trapper, static planner ik, velocity 3 m/s, friction 0 N, 6 episodes, ")
+    assert title.endswith("% solvable")
+    for word in ("steps to trap", "paper", "planner too slow", "late"):
+        assert word in head
+    several = format_table(TASK, [row(velocity=value) for value in (1.0, 2.0)])
+    title, _, head, _, first, second = several.splitlines()
+    assert title == "trapper, static planner ik, friction 0 N, 6 episodes"
+    assert head.split()[:2] == ["planner", "velocity"]
+    assert (first.split()[1], second.split()[1]) == ("1", "2")
+
+
+def test_figures_are_drawn_with_whatever_planners_and_settings(tmp_path):
+    rows = [row(outcomes(seed=seed), planner, velocity=seed) for seed in range(3) for planner in ("corner", "mine")]
+    plot_sweep(TASK, rows, "velocity", tmp_path / "sweep.png")
+    plot_results(TASK, rows[:2], tmp_path / "results.svg")
+    assert (tmp_path / "sweep.png").stat().st_size > 10_000
+    drawn = (tmp_path / "results.svg").read_text()
+    assert drawn.startswith("<?xml")
+
+
+def test_a_setting_nobody_could_solve_leaves_a_gap(tmp_path):
+    none = dataclasses.replace(outcomes(), solvable=torch.zeros(6, dtype=torch.bool))
+    rows = [row(none, velocity=1.0)]
+    assert rows[0].success_solvable is None
+    assert "–" in format_table(TASK, rows)
+    plot_sweep(TASK, rows, "velocity", tmp_path / "sweep.png")
+    plot_results(TASK, rows, tmp_path / "results.png")

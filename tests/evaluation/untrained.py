@@ -3,11 +3,12 @@
 import torch
 
 from torchdyn_plan.nets import ETANetwork, Forecaster
-from torchdyn_plan.planners import DynamicPlanner, IKPlanner
+from torchdyn_plan.planners import DynamicPlanner
+from torchdyn_plan.tasks.trapper.task import ik_planner
 
 
-def untrained(**settings):
+def untrained(**parts):
     torch.manual_seed(0)
     # Narrower ones take kernels whose last bit depends on a row's place in the block.
     nets = Forecaster(hidden=64).eval(), ETANetwork(hidden=64).eval()
-    return DynamicPlanner(IKPlanner(chunk=8), *nets, chunk=8, **settings).requires_grad_(False)
+    return DynamicPlanner(ik_planner(chunk=8), *nets, chunk=8, **parts).requires_grad_(False)

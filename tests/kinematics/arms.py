@@ -25,9 +25,14 @@ RIGHT, HALF = math.pi / 2, math.pi
 def universal(d1, a2, a3, d4, d5, d6):
     """A UR arm from its DH parameters."""
     return [
-        Row((0, 0, 0)), Row((0, 0, d1), (RIGHT, 0, 0)), Row((a2, 0, 0)), Row((a3, 0, 0)),
-        Row((0, 0, d4), (RIGHT, 0, 0)), Row((0, 0, d5), (-RIGHT, 0, 0)), Row((0, 0, d6), kind="fixed"),
-    ]  # fmt: skip
+        Row((0, 0, 0)),
+        Row((0, 0, d1), (RIGHT, 0, 0)),
+        Row((a2, 0, 0)),
+        Row((a3, 0, 0)),
+        Row((0, 0, d4), (RIGHT, 0, 0)),
+        Row((0, 0, d5), (-RIGHT, 0, 0)),
+        Row((0, 0, d6), kind="fixed"),
+    ]
 
 
 ARMS = {
@@ -35,24 +40,40 @@ ARMS = {
     "ur5e": universal(0.1625, -0.425, -0.3922, 0.1333, 0.0997, 0.0996),
     "ur10": universal(0.1273, -0.612, -0.5723, 0.163941, 0.1157, 0.0922),
     "panda": [
-        Row((0, 0, 0.333)), Row((0, 0, 0), (-RIGHT, 0, 0)), Row((0, -0.316, 0), (RIGHT, 0, 0)),
-        Row((0.0825, 0, 0), (RIGHT, 0, 0)), Row((-0.0825, 0.384, 0), (-RIGHT, 0, 0)), Row((0, 0, 0), (RIGHT, 0, 0)),
-        Row((0.088, 0, 0), (RIGHT, 0, 0)), Row((0, 0, 0.107), kind="fixed"),
+        Row((0, 0, 0.333)),
+        Row((0, 0, 0), (-RIGHT, 0, 0)),
+        Row((0, -0.316, 0), (RIGHT, 0, 0)),
+        Row((0.0825, 0, 0), (RIGHT, 0, 0)),
+        Row((-0.0825, 0.384, 0), (-RIGHT, 0, 0)),
+        Row((0, 0, 0), (RIGHT, 0, 0)),
+        Row((0.088, 0, 0), (RIGHT, 0, 0)),
+        Row((0, 0, 0.107), kind="fixed"),
     ],
     "iiwa": [
-        Row((0, 0, 0.15)), Row((0, 0, 0.19), (RIGHT, 0, HALF)), Row((0, 0.21, 0), (RIGHT, 0, HALF)),
-        Row((0, 0, 0.19), (RIGHT, 0, 0)), Row((0, 0.21, 0), (-RIGHT, HALF, 0)), Row((0, 0.0607, 0.19), (RIGHT, 0, 0)),
-        Row((0, 0.081, 0.0607), (-RIGHT, HALF, 0)), Row((0, 0, 0.045), kind="fixed"),
+        Row((0, 0, 0.15)),
+        Row((0, 0, 0.19), (RIGHT, 0, HALF)),
+        Row((0, 0.21, 0), (RIGHT, 0, HALF)),
+        Row((0, 0, 0.19), (RIGHT, 0, 0)),
+        Row((0, 0.21, 0), (-RIGHT, HALF, 0)),
+        Row((0, 0.0607, 0.19), (RIGHT, 0, 0)),
+        Row((0, 0.081, 0.0607), (-RIGHT, HALF, 0)),
+        Row((0, 0, 0.045), kind="fixed"),
     ],
     "scara": [
-        Row((0, 0, 0.3)), Row((0.3, 0, 0)), Row((0.25, 0, 0), kind="prismatic", axis=(0, 0, -1)), Row((0, 0, -0.1)),
+        Row((0, 0, 0.3)),
+        Row((0.3, 0, 0)),
+        Row((0.25, 0, 0), kind="prismatic", axis=(0, 0, -1)),
+        Row((0, 0, -0.1)),
         Row((0, 0, -0.05), kind="fixed"),
     ],
     "gantry": [
-        Row((0.1, 0, 1), kind="prismatic", axis=(1, 0, 0)), Row((0, 0.2, 0), (0.3, 0, 0), "prismatic", (0, 1, 0)),
-        Row((0, 0, -0.2), (HALF, 0, 0)), Row((0.3, 0, 0), (RIGHT, 0, 0)), Row((0.2, 0, 0.1), kind="fixed"),
+        Row((0.1, 0, 1), kind="prismatic", axis=(1, 0, 0)),
+        Row((0, 0.2, 0), (0.3, 0, 0), "prismatic", (0, 1, 0)),
+        Row((0, 0, -0.2), (HALF, 0, 0)),
+        Row((0.3, 0, 0), (RIGHT, 0, 0)),
+        Row((0.2, 0, 0.1), kind="fixed"),
     ],
-}  # fmt: skip
+}
 """By name; frames ``link0`` (the base) to ``tool``."""
 
 
@@ -80,9 +101,11 @@ def quaternion(rpy):
     r, p, y = (0.5 * angle for angle in rpy)
     (cr, sr), (cp, sp), (cy, sy) = ((math.cos(a), math.sin(a)) for a in (r, p, y))
     values = (
-        cr * cp * cy + sr * sp * sy, sr * cp * cy - cr * sp * sy, cr * sp * cy + sr * cp * sy,
+        cr * cp * cy + sr * sp * sy,
+        sr * cp * cy - cr * sp * sy,
+        cr * sp * cy + sr * cp * sy,
         cr * cp * sy - sr * sp * cy,
-    )  # fmt: skip
+    )
     return " ".join(map(repr, values))
 
 

@@ -109,12 +109,26 @@ def test_batch_dimensions_are_free_and_equal_a_loop(arm, batch):
     q = configurations(math.prod(batch), seed=4).reshape(*batch, 6)
     pose, jacobian = arm.pose_and_jacobian(q)
     assert (pose.shape, jacobian.shape) == ((*batch, 4, 4), (*batch, 6, 6))
-    for row, one, other in zip(
-        q.reshape(-1, 6), pose.reshape(-1, 4, 4), jacobian.reshape(-1, 6, 6), strict=True
-    ):  # fmt: skip
+    for row, one, other in zip(q.reshape(-1, 6), pose.reshape(-1, 4, 4), jacobian.reshape(-1, 6, 6), strict=True):
         expected = arm.pose_and_jacobian(row)
         torch.testing.assert_close(one, expected[0], atol=1e-13, rtol=0)
         torch.testing.assert_close(other, expected[1], atol=1e-13, rtol=0)
+
+
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+@pytest.mark.parametrize("form", [None, "transforms"])
+def test_an_arm_is_made_again_from_its_settings(dtype, form):
+    settings = {} if form is None else {"form": form}
+    first = Arm.ur5(tool_length=0.084, dtype=dtype)
+    first = Arm(**(first.part_settings() | settings))
+    again = Arm(**first.part_settings())
+    q = configurations(20, seed=6).to(dtype)
+    for one, other in zip(again.pose_and_jacobian(q), first.pose_and_jacobian(q), strict=True):
+        assert torch.equal(one, other)
+    for name in ("lower", "upper", "speed_limit"):
+        assert torch.equal(getattr(again, name), getattr(first, name)), name
+    assert (again.joint_names, again.joint_kinds) == (first.joint_names, first.joint_kinds)
+    assert type(again.form) is type(first.form)
 
 
 def test_single_precision_is_good_to_a_few_micrometres(arm):

@@ -4,7 +4,7 @@ import pytest
 import torch
 from torch.autograd import gradcheck
 
-from torchdyn_plan.kinematics import Arm, dls_step, limited_step, upright_error
+from torchdyn_plan.kinematics import Arm, dls_step, limited_step, square_turn, upright_error
 
 DAMPING = 0.02
 
@@ -119,3 +119,11 @@ def test_limited_step_keeps_direction_gain_and_limits():
 
 def test_no_step_stays_no_step():
     assert limited_step(torch.zeros(3, 6), torch.ones(6), 0.2).tolist() == torch.zeros(3, 6).tolist()
+
+
+def test_a_square_tool_turns_to_the_nearest_axis():
+    yaw = torch.tensor([-3.0, -0.8, -0.1, 0.0, 0.3, 0.7, 0.9, 1.5, 3.1], dtype=torch.float64)
+    turn = square_turn(yaw.cos(), yaw.sin())
+    quarters = (yaw + turn) / (math.pi / 2)
+    torch.testing.assert_close(quarters, quarters.round(), atol=1e-9, rtol=0)
+    assert turn.abs().max() <= math.pi / 4 + 1e-9

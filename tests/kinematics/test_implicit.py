@@ -35,9 +35,9 @@ def still():
 
 
 @pytest.mark.parametrize("q", [REGULAR, NEAR_SINGULAR], ids=["regular", "near singular"])
-@pytest.mark.parametrize("task", ["pose", "axis", "position"])
-def test_the_solution_has_its_derivative_in_the_target(q, task):
-    assert gradcheck(lambda small: solved(small, q, task=task), still(), eps=1e-5, atol=2e-3, rtol=2e-3)
+@pytest.mark.parametrize("constraint", ["pose", "axis", "position"])
+def test_the_solution_has_its_derivative_in_the_target(q, constraint):
+    assert gradcheck(lambda small: solved(small, q, constraint=constraint), still(), eps=1e-5, atol=2e-3, rtol=2e-3)
 
 
 def test_the_derivative_is_the_inverse_jacobian():
@@ -110,7 +110,7 @@ def test_the_solution_has_its_derivative_in_the_arm():
     place = arm(start.detach())(q)
 
     def solve(length):
-        return solve_ik(arm(length), place, q0=q, task="position", rounds=(1,), differentiable=True).q
+        return solve_ik(arm(length), place, q0=q, constraint="position", rounds=(1,), differentiable=True).q
 
     assert gradcheck(solve, start, eps=1e-5, atol=1e-3)
 

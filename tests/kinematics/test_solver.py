@@ -5,7 +5,7 @@ import torch
 
 from tests.kinematics.arms import ARMS, configurations, urdf
 from torchdyn_plan.errors import InputError
-from torchdyn_plan.kinematics import Arm, IKStatus, solve_ik, task_error
+from torchdyn_plan.kinematics import Arm, IKStatus, constraint_error, solve_ik
 
 DOUBLE = torch.float64
 ARM = Arm.ur5(dtype=DOUBLE)
@@ -16,8 +16,8 @@ def reachable(count, seed=0, arm=ARM):
     return arm(configurations(count, arm.num_joints, seed, arm.lower.dtype))
 
 
-def holds(arm, result, target, task="pose", symmetry=1):
-    error = task_error(arm(result.q), target, task=task, symmetry=symmetry)
+def holds(arm, result, target, constraint="pose", symmetry=1):
+    error = constraint_error(arm(result.q), target, constraint=constraint, symmetry=symmetry)
     within = (error[..., :3].norm(dim=-1) <= 1.001e-3) & (error[..., 3:].norm(dim=-1) <= 1.001 * math.radians(0.5))
     return within & (result.q >= arm.lower).all(-1) & (result.q <= arm.upper).all(-1)
 
@@ -32,14 +32,14 @@ def test_a_thousand_reachable_poses_are_solved_from_random_starts(dtype):
 
 
 @pytest.mark.parametrize(
-    ("name", "task"), [("panda", "pose"), ("iiwa", "pose"), ("scara", "position"), ("gantry", "axis")]
+    ("name", "constraint"), [("panda", "pose"), ("iiwa", "pose"), ("scara", "position"), ("gantry", "axis")]
 )
-def test_other_arms_are_solved(name, task):
+def test_other_arms_are_solved(name, constraint):
     arm = Arm.from_urdf(urdf(ARMS[name]), tip="tool", dtype=DOUBLE)
     target = reachable(60, arm=arm)
-    result = solve_ik(arm, target, task=task)
+    result = solve_ik(arm, target, constraint=constraint)
     assert (result.status == IKStatus.SOLVED).all()
-    assert holds(arm, result, target, task).all()
+    assert holds(arm, result, target, constraint).all()
 
 
 def mixed(count=10_000):
@@ -96,17 +96,17 @@ def test_a_joint_at_its_limit_is_named():
 
 
 @pytest.mark.parametrize("batch", [(), (1,), (2, 3), (0,)])
-@pytest.mark.parametrize("task", ["pose", "axis", "position"])
-def test_batch_dimensions_are_free(batch, task):
+@pytest.mark.parametrize("constraint", ["pose", "axis", "position"])
+def test_batch_dimensions_are_free(batch, constraint):
     target = reachable(math.prod(batch)).reshape(*batch, 4, 4)
-    result = solve_ik(ARM, target, task=task)
+    result = solve_ik(ARM, target, constraint=constraint)
     assert (result.q.shape, result.status.shape, result.residual.shape) == ((*batch, 6), batch, (*batch, 2))
-    assert holds(ARM, result, target, task).all()
+    assert holds(ARM, result, target, constraint).all()
 
 
 def test_a_position_alone_may_be_given_as_one():
     place = reachable(5)[:, :3, 3]
-    assert (ARM(solve_ik(ARM, place, task="position").q)[:, :3, 3] - place).norm(dim=-1).max() < 1e-3
+    assert (ARM(solve_ik(ARM, place, constraint="position").q)[:, :3, 3] - place).norm(dim=-1).max() < 1e-3
 
 
 def test_a_square_box_takes_the_nearest_quarter_turn():
@@ -144,7 +144,7 @@ def test_free_motion_is_drawn_to_the_posture():
         ({"q0": torch.zeros(5, dtype=DOUBLE)}, r"q0 must have shape \(\*B, 6\), got \(5,\)"),
         ({"q0": torch.zeros(3, 6, dtype=DOUBLE)}, r"q0 must have shape \(\*B, 2, 6\), got \(3, 6\)"),
         ({"posture": torch.zeros(6)}, "posture is torch.float32"),
-        ({"task": "axes"}, r"unknown task 'axes' \(did you mean 'axis'"),
+        ({"constraint": "axes"}, r"unknown constraint 'axes' \(did you mean 'axis'"),
         ({"symmetry": 0}, "symmetry must be >= 1, got 0"),
         ({"iterations": 2.5}, "iterations must be an integer"),
     ],

@@ -4,7 +4,7 @@ import pytest
 import torch
 from torch.autograd import gradcheck
 
-from torchdyn_plan.kinematics import Arm, rotation_vector, task_error, task_jacobian
+from torchdyn_plan.kinematics import Arm, constraint_error, constraint_jacobian, rotation_vector
 from torchdyn_plan.kinematics.joint import rotation_about, transform
 
 DOUBLE = torch.float64
@@ -42,25 +42,25 @@ def test_rotation_vector_has_a_gradient(angle):
     assert gradcheck(turned, torch.zeros(3, dtype=DOUBLE, requires_grad=True), atol=1e-5)
 
 
-@pytest.mark.parametrize("task", ["pose", "axis", "position"])
-def test_rows_of_the_jacobian_move_along_the_error(task):
+@pytest.mark.parametrize("constraint", ["pose", "axis", "position"])
+def test_rows_of_the_jacobian_move_along_the_error(constraint):
     arm = Arm.ur5(dtype=DOUBLE)
     q = torch.randn(20, 6, generator=torch.Generator().manual_seed(1), dtype=DOUBLE)
     target = arm(q)
     for joint in range(6):
         moved = q.clone()
         moved[:, joint] += 1e-5
-        slope = -task_error(arm(moved), target, task=task) / 1e-5
-        rows = task_jacobian(arm.pose_and_jacobian(q)[1], target, task=task)
+        slope = -constraint_error(arm(moved), target, constraint=constraint) / 1e-5
+        rows = constraint_jacobian(arm.pose_and_jacobian(q)[1], target, constraint=constraint)
         torch.testing.assert_close(rows[..., joint], slope, atol=2e-5, rtol=0)
 
 
 def test_yaw_is_free_for_an_axis():
     pose = transform(rotation_about(torch.tensor([0.0, 0.6, 0.8], dtype=DOUBLE), 0.7), (0.1, 0.2, 0.3))
     yaw = transform(rotation_about(torch.tensor([0.0, 0.0, 1.0], dtype=DOUBLE), 1.3))
-    assert task_error(pose @ yaw, pose, task="axis").abs().max() < 1e-12
+    assert constraint_error(pose @ yaw, pose, constraint="axis").abs().max() < 1e-12
     flipped = pose @ transform(rotation_about(torch.tensor([1.0, 0.0, 0.0], dtype=DOUBLE), math.pi))
-    assert task_error(flipped, pose, task="axis")[3:].norm() == pytest.approx(math.pi)
+    assert constraint_error(flipped, pose, constraint="axis")[3:].norm() == pytest.approx(math.pi)
 
 
 @pytest.mark.parametrize("symmetry", [2, 4, 6])
@@ -70,6 +70,6 @@ def test_parts_of_a_turn_are_nothing_to_a_symmetric_tool(symmetry):
         yaw = transform(
             rotation_about(torch.tensor([0.0, 0.0, 1.0], dtype=DOUBLE), part * 2 * math.pi / symmetry + 0.1)
         )
-        error = task_error(pose @ yaw, pose, symmetry=symmetry)
+        error = constraint_error(pose @ yaw, pose, symmetry=symmetry)
         assert error[3:].norm() == pytest.approx(0.1)
         assert error[:3].abs().max() < 1e-12

@@ -3,7 +3,8 @@ import torch
 
 from torchdyn_plan.errors import InputError
 from torchdyn_plan.nets import ETAConfig, ETANetwork
-from torchdyn_plan.nets.eta import arrival_classes, decode_expectation, decode_mode
+from torchdyn_plan.nets.distributions import decode_expectation, decode_mode
+from torchdyn_plan.nets.eta import arrival_classes
 
 
 @pytest.fixture
@@ -54,7 +55,7 @@ def test_statistics_standardise_the_inputs(network):
 
 def test_mode_is_the_middle_of_the_likeliest_bin():
     logits = torch.full((101, 101), -9.0).fill_diagonal_(9.0)
-    steps, never = decode_mode(logits)
+    steps, never = decode_mode(logits)[:2]
     assert steps[:100].tolist() == [5 * k + 2 for k in range(100)]
     assert never.tolist() == [False] * 100 + [True]
 
@@ -64,7 +65,7 @@ def test_expectation_lies_between_bins_and_never_is_a_majority():
     shares[0, [4, 5]] = torch.tensor([0.25, 0.75])
     shares[1, [4, 100]] = torch.tensor([0.45, 0.55])
     shares[2, [4, 9, 100]] = torch.tensor([0.3, 0.3, 0.4])
-    steps, never = decode_expectation(shares.log())
+    steps, never = decode_expectation(shares.log())[:2]
     assert steps.tolist() == pytest.approx([22 + 0.75 * 5, 22, (22 + 47) / 2])
     assert never.tolist() == [False, True, False]
 
@@ -77,7 +78,7 @@ def test_targets_are_unbiased_and_hold_their_bin():
     assert bool(((classes > 0).sum(-1) <= 2).all())
     assert torch.equal(classes.argmax(-1), holding)
     assert torch.equal(holding, arrival // 5)
-    steps, never = decode_expectation(classes.log())
+    steps, never = decode_expectation(classes.log())[:2]
     # The outer halves of the first and the last bin have no neighbour to lean on.
     torch.testing.assert_close(steps, arrival.clamp(2, 497).float(), atol=1e-3, rtol=0)
     assert not never.any()
@@ -96,13 +97,26 @@ def test_targets_with_bins_of_one_step():
     assert torch.equal(classes, torch.eye(7)[holding])
 
 
-@pytest.mark.parametrize("reading", ["mode", "expectation"])
-def test_arrival_reads_the_logits(network, reading):
+@pytest.mark.parametrize("estimator", ["mode", "expectation"])
+def test_arrival_reads_the_logits(network, estimator):
     state, goal = samples(8)
-    arrival = network.arrival(state, goal, reading=reading)
-    expected = {"mode": decode_mode, "expectation": decode_expectation}[reading](network(state, goal))
+    arrival = network.arrival(state, goal, estimator=estimator)
+    expected = {"mode": decode_mode, "expectation": decode_expectation}[estimator](network(state, goal))
     assert torch.equal(arrival.steps, expected.steps)
     assert torch.equal(arrival.never, expected.never)
+    assert arrival.bins is None
+
+
+def test_a_distribution_is_the_expectation_and_the_shares_of_the_bins(network):
+    state, goal = samples(8)
+    arrival, shares = network.arrival(state, goal, estimator="distribution"), network(state, goal).softmax(-1)
+    expected = network.arrival(state, goal, estimator="expectation")
+    assert torch.equal(arrival.steps, expected.steps)
+    assert torch.equal(arrival.never, expected.never)
+    assert torch.equal(arrival.bins, shares[:, :100])
+    assert arrival.bin_width == 5
+    soft = network.arrival(state, goal, estimator="soft")
+    torch.testing.assert_close(soft.never, 1 - arrival.bins.sum(-1))
 
 
 def test_wrong_inputs_are_named(network):
@@ -114,6 +128,6 @@ def test_wrong_inputs_are_named(network):
     with pytest.raises(InputError, match="goal must be finite"):
         network(state, goal * float("nan"))
     with pytest.raises(InputError, match="expectation"):
-        network.arrival(state, goal, reading="expectaton")
+        network.arrival(state, goal, estimator="expectaton")
     with pytest.raises(InputError, match=r"tool_slice.*\(13, 16\)"):
         ETAConfig(tool_slice=(13, 16))

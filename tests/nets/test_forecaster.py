@@ -56,9 +56,9 @@ def test_batch_is_free_and_equals_a_loop(network, batch):
     torch.testing.assert_close(forecast.reshape(-1, 20, 3), torch.stack(rows))
 
 
-def test_forecast_is_the_folded_line(network):
+def test_forecast_is_the_reflected_line(network):
     history = histories(50)
-    line, forecast = network.unfolded(history), network(history)
+    line, forecast = network.unreflected(history), network(history)
     extent = network.config.half_extent
     if extent is None:
         assert torch.equal(line, forecast)

@@ -8,11 +8,14 @@ from tensordict import TensorDict
 from torchdyn_plan.envs import TrapperScene
 from torchdyn_plan.kinematics import Arm
 from torchdyn_plan.planners import IKPlanner
-from torchdyn_plan.planners.approach import Approach
+from torchdyn_plan.tasks.trapper.approach import BoxApproach
+from torchdyn_plan.tasks.trapper.task import ik_planner
 
-SCENE, APPROACH = TrapperScene(), Approach()
+SCENE = TrapperScene()
+APPROACH = BoxApproach.of(SCENE)
 BASE = torch.tensor(APPROACH.base_pos)
-DOUBLE = IKPlanner(Arm.ur5(tool_length=APPROACH.tool_length, dtype=torch.float64))
+DOUBLE = IKPlanner(Arm.ur5(tool_length=SCENE.tool_length, dtype=torch.float64), approach=APPROACH)
+SINGLE = ik_planner(SCENE)
 MIDDLE = torch.tensor([0.1, -0.2, 0.0])
 """A goal on the table, well within reach."""
 

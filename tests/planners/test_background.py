@@ -3,14 +3,14 @@ from concurrent.futures import Executor, Future
 import pytest
 import torch
 
-from tests.planners.test_latency import run
-from tests.planners.test_meeting import line
-from tests.planners.test_meeting import make_planner as make_meeting_planner
-from tests.planners.toy import assert_same, make_planner, observation
+from tests.planners.test_delivery import run
+from tests.planners.toy import NO_MEMORY, assert_same, make_planner, observation
+from tests.tasks.trapper.crossing import line
+from tests.tasks.trapper.crossing import make_planner as make_waiting_planner
 from torchdyn_plan.errors import InputError
-from torchdyn_plan.planners import ReplanSchedule
-from torchdyn_plan.planners.background import Background, measured_latency
-from torchdyn_plan.planners.latency import Delayed
+from torchdyn_plan.planners import Background, Delayed, Observation, ReplanSchedule, measured_latency
+
+pytestmark = pytest.mark.filterwarnings(NO_MEMORY)
 
 SCHEDULE = ReplanSchedule.every(10, first_step=3)
 LATENCY = 2
@@ -24,7 +24,8 @@ class ByHand(Executor):
 
     def submit(self, function, /, *args):
         executor, number = self, len(self.jobs)
-        self.jobs.append((args[0].step_count.max().item(), args))
+        observation = next(value for value in args if isinstance(value, Observation))
+        self.jobs.append((observation.step_count.max().item(), args))
 
         class Job(Future):
             def done(self):
@@ -40,8 +41,7 @@ def play(ready_after, steps=30, deadline=5, latency=LATENCY):
     """What is written at each step when a plan is ready so many steps after it was ordered; and the delivery."""
     executor = ByHand(ready_after)
     delivery = Background(latency=latency, deadline=deadline, executor=executor)
-    planner = make_planner(schedule=SCHEDULE)
-    planner.set_latency(latency, delivery)
+    planner = make_planner(schedule=SCHEDULE, delivery=delivery)
     clock = planner.forward
 
     def forward(td):
@@ -53,20 +53,22 @@ def play(ready_after, steps=30, deadline=5, latency=LATENCY):
 
 
 @pytest.mark.parametrize("ready_after", [0, 1, 2])
-def test_a_plan_that_is_ready_in_time_comes_into_use_as_one_that_takes_as_long_as_told(ready_after):
+def test_a_plan_that_is_ready_in_time_comes_into_use_as_one_that_takes_as_long_as_foreseen(ready_after):
     found, delivery = play(ready_after)
-    told = run(make_planner(schedule=SCHEDULE, latency=LATENCY), 30)
-    for one, other in zip(found, told, strict=True):
-        assert_same(one, other.exclude(*[("plan", name) for name in Delayed(1).keys(one["plan"].keys())]))
+    foreseen = run(make_planner(schedule=SCHEDULE, delivery=Delayed(LATENCY)), 30)
+    for one, other in zip(found, foreseen, strict=True):
+        pending = [("plan", name) for name in other["plan"].keys() if name.startswith("pending_")]  # noqa: SIM118
+        assert len(pending) == 8
+        assert_same(one, other.exclude(*pending))
     assert (delivery.used, delivery.missed) == (3, 0)
 
 
 def test_a_late_plan_is_as_old_as_it_is():
     found, delivery = play(4)
-    told = run(make_planner(schedule=SCHEDULE, latency=LATENCY), 30)
-    assert torch.equal(found[7]["goal"], told[7]["goal"])
-    assert torch.equal(found[7]["arrival_steps"], told[7]["arrival_steps"])
-    assert torch.equal(found[6]["goal"], told[4]["goal"])
+    foreseen = run(make_planner(schedule=SCHEDULE, delivery=Delayed(LATENCY)), 30)
+    assert torch.equal(found[7]["goal"], foreseen[7]["goal"])
+    assert torch.equal(found[7]["arrival_steps"], foreseen[7]["arrival_steps"])
+    assert torch.equal(found[6]["goal"], foreseen[4]["goal"])
     assert (delivery.used, delivery.missed) == (3, 0)
 
 
@@ -81,8 +83,7 @@ def test_no_drop_begins_when_plans_stay_away():
     drops = []
     for deadline in (4, 400):
         executor = ByHand(2)
-        planner = make_meeting_planner(schedule=ReplanSchedule.every(5))
-        planner.set_latency(2, Background(latency=2, deadline=deadline, executor=executor))
+        planner = make_waiting_planner(delivery=Background(latency=2, deadline=deadline, executor=executor))
         scene, plan = line(), None
         for step in range(140):
             executor.now, executor.steps = step, 2 if step < 20 or deadline > 4 else 9
@@ -94,8 +95,8 @@ def test_no_drop_begins_when_plans_stay_away():
 
 def test_a_plan_for_an_episode_that_is_over_is_dropped():
     executor = ByHand(3)
-    delivery, planner = Background(latency=2, deadline=9, executor=executor), make_planner(schedule=SCHEDULE)
-    planner.set_latency(2, delivery)
+    delivery = Background(latency=2, deadline=9, executor=executor)
+    planner = make_planner(schedule=SCHEDULE, delivery=delivery)
     td = observation((2,), step=3)
     executor.now = 3
     planner(td)
@@ -108,9 +109,8 @@ def test_a_plan_for_an_episode_that_is_over_is_dropped():
 
 
 def test_a_thread_of_its_own_plans_and_its_errors_come_to_the_loop():
-    planner = make_planner(schedule=SCHEDULE)
     delivery = Background(latency=0, deadline=400)
-    planner.set_latency(0, delivery)
+    planner = make_planner(schedule=SCHEDULE, delivery=delivery)
     td = observation((2,), step=3)
     planner(td)
     delivery.executor.submit(int).result()

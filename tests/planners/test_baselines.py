@@ -2,10 +2,18 @@ import pytest
 import torch
 from tensordict import TensorDict
 
-from tests.planners.toy import SCHEDULE, SPEED, Straight, StraightArrival, ToyEnv, go_straight, observation
+from tests.planners.toy import NO_MEMORY, SCHEDULE, SPEED, Straight, StraightArrival, ToyEnv, go_straight, observation
 from torchdyn_plan.errors import InputError
-from torchdyn_plan.planners import DynamicPlanner, OracleTrajectory, PlanStatus, TargetPursuit, WaitAtEnd
-from torchdyn_plan.planners.baselines import RecordedFuture
+from torchdyn_plan.planners import (
+    DynamicPlanner,
+    PlanStatus,
+    RecordedFuture,
+    TargetPursuit,
+    oracle_trajectory,
+    wait_at_end,
+)
+
+pytestmark = pytest.mark.filterwarnings(NO_MEMORY)
 
 
 def test_pursuit_goes_where_the_target_is_at_every_step():
@@ -25,9 +33,10 @@ def test_pursuit_declares_its_keys_and_names_a_missing_one():
 
 
 def test_the_one_who_waits_goes_to_the_end_of_each_forecast():
-    planner, td = WaitAtEnd(go_straight(), Straight(), StraightArrival(), schedule=SCHEDULE), observation((2, 3), 3)
+    planner = wait_at_end(go_straight(), Straight(), StraightArrival(), schedule=SCHEDULE)
+    td = observation((2, 3), 3)
     td["target_history"] = 0.1 * td["target_history"]
-    end = Straight()(td["target_history"])[..., -1, :]
+    end = Straight().path(td["target_history"])[..., -1, :]
     near = planner(td.clone())
     assert torch.equal(near["goal"], end)
     assert (near["arrival_steps"] == 40).all()
@@ -40,7 +49,7 @@ def test_the_one_who_waits_goes_to_the_end_of_each_forecast():
 
 def test_the_recorded_future_begins_with_the_next_step_and_stops_at_its_end():
     recording = torch.arange(8.0)[:, None].expand(8, 3).expand(3, 8, 3)
-    future = RecordedFuture(horizon=4)(recording, torch.tensor([0, 5, 30]))
+    future = RecordedFuture(horizon=4).predict(recording, torch.tensor([0, 5, 30])).path
     assert future[..., 1].tolist() == [[1, 2, 3, 4], [6, 7, 7, 7], [7, 7, 7, 7]]
 
 
@@ -50,7 +59,7 @@ def test_the_oracle_is_the_dynamic_planner_with_the_truth_as_forecast(batch):
     start, velocity = torch.rand(*batch, 1, 3), 0.02 * torch.rand(*batch, 1, 3)
     recording = start + velocity * torch.arange(100.0)[:, None]
     parts = {"schedule": SCHEDULE}
-    oracle = OracleTrajectory(go_straight(), StraightArrival(), horizon=40, **parts)
+    oracle = oracle_trajectory(go_straight(), StraightArrival(), horizon=40, **parts)
     dynamic = DynamicPlanner(go_straight(), Straight(horizon=40), StraightArrival(), **parts)
     a = observation(batch).exclude("target_history").set("target_future", recording)
     b = observation(batch)
@@ -67,7 +76,7 @@ def test_the_oracle_is_the_dynamic_planner_with_the_truth_as_forecast(batch):
 
 
 def test_the_oracle_never_looks_at_the_history_and_needs_a_recording():
-    oracle = OracleTrajectory(go_straight(), StraightArrival(), schedule=SCHEDULE)
+    oracle = oracle_trajectory(go_straight(), StraightArrival(), schedule=SCHEDULE)
     assert "target_history" not in oracle.in_keys
     with pytest.raises(InputError, match="reads the key 'target_future'"):
         oracle(observation((2,)))
@@ -80,4 +89,4 @@ def test_the_oracle_never_looks_at_the_history_and_needs_a_recording():
 @pytest.mark.parametrize("horizon", [0, 1.5])
 def test_a_bad_horizon_is_refused(horizon):
     with pytest.raises(InputError, match=f"horizon.*{horizon}"):
-        OracleTrajectory(go_straight(), StraightArrival(), horizon=horizon)
+        oracle_trajectory(go_straight(), StraightArrival(), horizon=horizon)

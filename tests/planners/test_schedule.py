@@ -4,18 +4,40 @@ import pytest
 import torch
 
 from torchdyn_plan.errors import InputError
-from torchdyn_plan.planners import ReplanSchedule
-from torchdyn_plan.planners.schedule import Drift, EventSchedule
+from torchdyn_plan.planners import EventSchedule, Observation, Plan, ReplanSchedule
+from torchdyn_plan.planners.schedule import Clock
 
 PAPER_STEPS = [13, 80, 140, 194, 242, 285, 323, 357, 387, 414, 439, 464, 489]
 PAPER_WINDOWS = [67, 60, 54, 48, 43, 38, 34, 30, 27, 25, 25, 25, 25]
 
 
-def run(schedule, steps, device="cpu"):
+def seen(step_count):
+    """Observation of targets at the origin at steps ``step_count`` (*B,)."""
+    place = torch.zeros(*step_count.shape, 3)
+    return Observation(place, place, place, step_count, ())
+
+
+def in_time(rows):
+    """Robots that are never late."""
+    return torch.zeros(rows.shape)
+
+
+def tick(schedule, clock, step_count, *, plan=None, busy=None, late=in_time):
+    """Clock and due rows at steps ``step_count`` (*B,), from the ``clock`` of the step before; fresh at step 0."""
+    observation = seen(step_count)
+    start = schedule.start(observation)
+    if clock is not None:
+        pairs = zip(start, clock.older(), strict=True)
+        start = Clock(*(torch.where(step_count == 0, new, old) for new, old in pairs))
+    plan = Plan.hold(observation, 1) if plan is None else plan
+    return schedule.tick(start, observation, plan, busy=busy, late=late)
+
+
+def run(schedule, steps):
     """Steps at which a plan was due, and the windows that began there, of one episode."""
     clock, due_at, windows = None, [], []
     for t in range(steps):
-        clock, due = schedule.tick(clock, torch.tensor([t], device=device))
+        clock, due = tick(schedule, clock, torch.tensor([t]))
         if due:
             due_at.append(t)
             windows.append(int(clock.window))
@@ -30,7 +52,7 @@ def test_the_papers_episode():
 def test_countdown_tells_the_steps_to_the_next_plan():
     clock = None
     for t in range(500):
-        clock, due = ReplanSchedule().tick(clock, torch.tensor([t]))
+        clock, due = tick(ReplanSchedule(), clock, torch.tensor([t]))
         coming = [s for s in PAPER_STEPS if s > t]
         if coming:
             assert int(clock.countdown) == coming[0] - t
@@ -55,7 +77,7 @@ def test_rows_that_reset_start_afresh_and_leave_the_others_alone():
     period = torch.tensor([50, 80, 110, 500])
     schedule, clock, got = ReplanSchedule(), None, [[] for _ in period]
     for t in range(500):
-        clock, due = schedule.tick(clock, t % period)
+        clock, due = tick(schedule, clock, t % period)
         for row in due.nonzero().flatten().tolist():
             got[row].append(t)
     for row, p in enumerate(period.tolist()):
@@ -63,15 +85,15 @@ def test_rows_that_reset_start_afresh_and_leave_the_others_alone():
 
 
 def test_a_clock_that_is_first_read_in_mid_episode_plans_at_once():
-    clock, due = ReplanSchedule().tick(None, torch.tensor([[5, 13], [14, 300]]))
+    clock, due = tick(ReplanSchedule(), None, torch.tensor([[5, 13], [14, 300]]))
     assert due.tolist() == [[False, True], [True, True]]
     assert clock.countdown.tolist() == [[8, 67], [67, 67]]
 
 
 def test_other_tasks_change_numbers_only():
-    assert run(ReplanSchedule(first_step=0, window=8, shrink=0.5, minimum=1), 12) == (
-        [0, 4, 6, 7, 8, 9, 10, 11], [4, 2, 1, 1, 1, 1, 1, 1],
-    )  # fmt: skip
+    due_at, windows = run(ReplanSchedule(first_step=0, window=8, shrink=0.5, minimum=1), 12)
+    assert due_at == [0, 4, 6, 7, 8, 9, 10, 11]
+    assert windows == [4, 2, 1, 1, 1, 1, 1, 1]
 
 
 @pytest.mark.parametrize(
@@ -82,27 +104,35 @@ def test_bad_numbers_are_named(bad):
         ReplanSchedule(**bad)
 
 
+def plan_of(miss, over):
+    """A plan by which the target at the origin should be ``miss`` (N,) away, and is met now where ``over`` (N,)."""
+    count = len(miss)
+    plan = Plan.hold(seen(torch.ones(count, dtype=torch.int64)), 1)
+    path = torch.nn.functional.pad(miss.reshape(count, 1, 1), (0, 2))
+    return plan._replace(path=path, arrival_steps=torch.where(over, 0, 30))
+
+
 class Looks:
-    """What a plan's drift is at each step, and the steps at which somebody looked."""
+    """How the plan fits at each step, and the steps at which somebody looked."""
 
     def __init__(self, miss=(), late=(), over=()):
         self.miss, self.late, self.over, self.seen, self.now = miss, late, over, [], 0
 
+    @property
+    def plan(self):
+        return plan_of(torch.tensor([1.0 if self.now in self.miss else 0.0]), torch.tensor([self.now in self.over]))
+
     def __call__(self, rows):
         self.seen.append(self.now)
-        shape = rows.shape
-        return Drift(
-            torch.full(shape, 1.0 if self.now in self.miss else 0.0),
-            torch.full(shape, 9.0 if self.now in self.late else 0.0),
-            torch.full(shape, self.now in self.over),
-        )
+        return torch.full(rows.shape, 9.0 if self.now in self.late else 0.0)
 
 
 def watch(schedule, steps, looks, busy=()):
     clock, due_at = None, []
     for t in range(steps):
         looks.now = t
-        clock, due = schedule.tick(clock, torch.tensor([t]), busy=torch.tensor([t in busy]), look=looks)
+        step, now_busy = torch.tensor([t]), torch.tensor([t in busy])
+        clock, due = tick(schedule, clock, step, plan=looks.plan, busy=now_busy, late=looks)
         if due:
             due_at.append(t)
     return due_at
@@ -134,12 +164,8 @@ def test_a_busy_row_plans_at_the_next_look():
 def test_rows_with_events_leave_the_others_alone():
     clock, got = None, [[], [], []]
     for t in range(80):
-        step = torch.tensor([t, t, t % 40])
-
-        def look(rows, now=t):
-            return Drift(torch.tensor([1.0, 0.0, 0.0]) * (now == 28), torch.zeros(3), torch.zeros(3) > 1)
-
-        clock, due = EVENTS.tick(clock, step, look=look)
+        plan = plan_of(torch.tensor([1.0, 0.0, 0.0]) * (t == 28), torch.zeros(3, dtype=torch.bool))
+        clock, due = tick(EVENTS, clock, torch.tensor([t, t, t % 40]), plan=plan)
         for row in due.nonzero().flatten().tolist():
             got[row].append(t)
     assert got == [[13, 28, 58], [13, 43, 73], [13, 53]]

@@ -1,14 +1,26 @@
 import pytest
 import torch
 
-from tests.planners.test_meeting import make_planner as make_meeting_planner
-from tests.planners.test_meeting import world
-from tests.planners.toy import HISTORY, SCHEDULE, Straight, StraightArrival, go_straight, make_planner, observation
+from tests.planners.toy import (
+    HISTORY,
+    NO_MEMORY,
+    SCHEDULE,
+    Straight,
+    StraightArrival,
+    go_straight,
+    make_planner,
+    observation,
+)
+from tests.tasks.trapper.crossing import make_planner as make_waiting_planner
+from tests.tasks.trapper.crossing import world
 from torchdyn_plan.errors import InputError
-from torchdyn_plan.planners import DynamicPlanner, PlanStatus
-from torchdyn_plan.planners.status import FARTHEST, input_status, usable_forecast
+from torchdyn_plan.planners import DynamicPlanner, LostBelow, Observation, PlanStatus
+from torchdyn_plan.planners.plan import FARTHEST, input_status, usable_path
+
+pytestmark = pytest.mark.filterwarnings(NO_MEMORY)
 
 NAN, INF = float("nan"), float("inf")
+POCKETED = LostBelow(seen_below=-0.042, forecast_below=0.0)
 
 
 def calm(*batch):
@@ -23,11 +35,11 @@ class Mocked(Straight):
 
     garbage = None
 
-    def forward(self, history):
-        forecast = super().forward(history)
+    def path(self, history):
+        path = super().path(history)
         if self.garbage is not None:
-            forecast[(history[:, -1, 1] < 0).nonzero().squeeze(-1), 7, 1] = self.garbage
-        return forecast
+            path[(history[:, -1, 1] < 0).nonzero().squeeze(-1), 7, 1] = self.garbage
+        return path
 
 
 def spoil_history(td, value, row=1):
@@ -49,7 +61,7 @@ FAULTS = [
     pytest.param(spoil_history, NAN, PlanStatus.BAD_INPUT, id="history nan"),
     pytest.param(spoil_history, INF, PlanStatus.BAD_INPUT, id="history inf"),
     pytest.param(spoil_target, NAN, PlanStatus.BAD_INPUT, id="target nan"),
-    pytest.param(sink, None, PlanStatus.TARGET_GONE, id="target gone"),
+    pytest.param(sink, None, PlanStatus.TARGET_LOST, id="target lost"),
 ]
 
 
@@ -69,8 +81,8 @@ def follow(planner, faulty, spoil, value, steps=30):
 
 @pytest.mark.parametrize(("spoil", "value", "status"), FAULTS)
 def test_a_row_that_cannot_plan_holds_says_so_and_recovers_and_the_others_do_not_notice(spoil, value, status):
-    found = follow(make_planner(gone_below=-0.042), range(2, 9), spoil, value)
-    usual = follow(make_planner(gone_below=-0.042), (), spoil, value)
+    found = follow(make_planner(lost=POCKETED), range(2, 9), spoil, value)
+    usual = follow(make_planner(lost=POCKETED), (), spoil, value)
     codes = torch.stack([td["plan", "status"] for td in found]).T.tolist()
     waiting, well = [PlanStatus.WAITING], [PlanStatus.OK]
     assert codes[0] == codes[2] == waiting * 3 + well * 27
@@ -91,13 +103,13 @@ def test_a_row_that_cannot_plan_holds_says_so_and_recovers_and_the_others_do_not
 
 @pytest.mark.parametrize(("spoil", "value", "status"), FAULTS)
 def test_between_plans_a_fault_is_told_and_the_plan_is_kept(spoil, value, status):
-    found, usual = (follow(make_planner(gone_below=-0.042), faulty, spoil, value, 12) for faulty in (range(5, 8), ()))
+    found, usual = (follow(make_planner(lost=POCKETED), faulty, spoil, value, 12) for faulty in (range(5, 8), ()))
     assert [int(td["plan", "status"][1]) for td in found] == [1] * 3 + [0] * 2 + [status] * 3 + [0] * 4
     assert all(torch.equal(td["goal"], other["goal"]) for td, other in zip(found, usual, strict=True))
 
 
 def test_a_fault_from_the_start_to_the_end_leaves_the_arm_at_rest():
-    found = follow(make_planner(gone_below=-0.042), range(30), spoil_history, NAN)
+    found = follow(make_planner(lost=POCKETED), range(30), spoil_history, NAN)
     assert all(td["plan", "status"][1] == PlanStatus.BAD_INPUT for td in found)
     assert all(torch.equal(td["tool_pos"][1], found[0]["tool_pos"][1]) for td in found)
 
@@ -159,8 +171,8 @@ class Spoiled:
 
 @pytest.mark.parametrize(("spoil", "value", "status"), FAULTS)
 @pytest.mark.parametrize("begin", [0, 10, 40])
-def test_a_meeting_planner_holds_and_recovers_too(spoil, value, status, begin):
-    planner, scene, usual = Spoiled(make_meeting_planner()), world(3), world(3).run(make_meeting_planner(), begin + 45)
+def test_one_that_waits_and_drops_holds_and_recovers_too(spoil, value, status, begin):
+    planner, scene, usual = Spoiled(make_waiting_planner()), world(3), world(3).run(make_waiting_planner(), begin + 45)
 
     def run(steps):
         # The planner writes into the copy that it was shown.
@@ -199,39 +211,48 @@ class Through:
         return td.update(written.select("goal", "action", "arrival_steps", "plan"))
 
 
+def looking(target_pos, *seen):
+    """Observation of targets at ``target_pos`` (*B, 3)."""
+    step_count = torch.ones(target_pos.shape[:-1], dtype=torch.int64)
+    return Observation(torch.zeros_like(target_pos), target_pos, target_pos, step_count, seen)
+
+
 def test_input_is_judged_for_any_batch():
     target = torch.zeros(2, 3, 3)
     target[0, 1, 1], target[1, 2, 2], target[1, 0, 2] = NAN, -0.5, -0.2
     seen = torch.zeros(2, 3, 6, 3), torch.zeros(2, 3, dtype=torch.int64)
     seen[0][1, 1, 5, 2] = -INF
-    codes = input_status(target, seen, -0.3)
-    bad, gone = PlanStatus.BAD_INPUT, PlanStatus.TARGET_GONE
-    assert codes.tolist() == [[0, bad, 0], [0, bad, gone]]
-    assert input_status(target[0, 1], [value[0, 1] for value in seen], -0.3) == bad
+    lost = LostBelow(seen_below=-0.3, forecast_below=0.0)
+    codes = input_status(looking(target, *seen), lost)
+    assert codes.tolist() == [[0, PlanStatus.BAD_INPUT, 0], [0, PlanStatus.BAD_INPUT, PlanStatus.TARGET_LOST]]
+    assert input_status(looking(target[0, 1], *(value[0, 1] for value in seen)), lost) == PlanStatus.BAD_INPUT
+    assert input_status(looking(target, *seen), None).tolist() == [[0, PlanStatus.BAD_INPUT, 0]] * 2
 
 
 def test_opposite_infinities_are_no_number():
     history = torch.zeros(1, 4, 3)
     history[0, :2, 0] = torch.tensor([INF, -INF])
-    assert input_status(torch.zeros(1, 3), [history], -1.0).tolist() == [PlanStatus.BAD_INPUT]
+    assert input_status(looking(torch.zeros(1, 3), history), None).tolist() == [PlanStatus.BAD_INPUT]
 
 
 def test_a_forecast_of_no_use_is_a_target_at_rest():
     forecast = torch.randn(3, 5, 3, generator=torch.Generator().manual_seed(0))
     forecast[1, 4, 2] = NAN
     target = torch.tensor([[1.0, 2.0, 3.0]]).expand(3, 3)
-    known, usable = usable_forecast(forecast, target)
+    known, usable = usable_path(forecast, target)
     assert usable.tolist() == [True, False, True]
     assert torch.equal(known[[0, 2]], forecast[[0, 2]])
     assert torch.equal(known[1], target[:1].expand(5, 3))
 
 
-def test_a_planner_without_a_table_takes_no_target_for_gone():
+def test_where_nothing_can_be_lost_no_target_is():
     td = observation((2,), step=3)
     sink(td)
-    assert (make_planner()(td)["plan", "status"] != PlanStatus.TARGET_GONE).all()
+    assert (make_planner()(td)["plan", "status"] != PlanStatus.TARGET_LOST).all()
 
 
-def test_a_bad_height_is_refused():
-    with pytest.raises(InputError, match="gone_below must be a finite number, got nan"):
-        make_planner(gone_below=NAN)
+@pytest.mark.parametrize("name", ["seen_below", "forecast_below"])
+@pytest.mark.parametrize("height", [NAN, -INF])
+def test_a_bad_height_is_refused(name, height):
+    with pytest.raises(InputError, match=f"{name} must be a finite number, got {height}"):
+        LostBelow(**{"seen_below": 0.0, "forecast_below": 0.0, name: height})

@@ -1,45 +1,44 @@
 """A point robot that chases a point on a line: the smallest world in which a planner has all its keys."""
 
-from typing import NamedTuple
-
 import torch
 from tensordict import TensorDict
-from torch import Tensor, nn
 from torchrl.data import Binary, Bounded, Composite, Unbounded
 from torchrl.envs import EnvBase
 
+from torchdyn_plan.nets import Arrival, ArrivalModel, Forecast, ForecastModel
 from torchdyn_plan.planners import CallablePlanner, DynamicPlanner, ReplanSchedule
+from torchdyn_plan.planners.planner import observe
 
 HISTORY, SPEED = 6, 0.01
+NO_MEMORY = "ignore:a planner remembers nothing:RuntimeWarning"
+"""For tests that show a planner rows in mid-episode and no memory, to plan at once."""
 SCHEDULE = ReplanSchedule(first_step=3, window=12, shrink=0.9, minimum=5)
 
 
-class Arrival(NamedTuple):
-    steps: Tensor
-    never: Tensor
-
-
-class Straight(nn.Module):
+class Straight(ForecastModel):
     """Forecaster that goes on as in the last step; counts the rows that it saw."""
 
     def __init__(self, horizon=40):
         super().__init__()
         self.horizon, self.rows = horizon, []
 
-    def forward(self, history):
-        self.rows.append(history.shape[0])
+    def path(self, history):
         ahead = torch.arange(1, self.horizon + 1, dtype=history.dtype, device=history.device)
         return history[..., -1:, :] + ahead[:, None] * (history[..., -1:, :] - history[..., -2:-1, :])
 
+    def predict(self, history):
+        self.rows.append(history.shape[0])
+        return Forecast(self.path(history))
 
-class StraightArrival(nn.Module):
+
+class StraightArrival(ArrivalModel):
     """Arrival of a robot that goes straight at `SPEED`; the state ends with the tool position."""
 
     def __init__(self):
         super().__init__()
         self.shapes = []
 
-    def arrival(self, robot_state, goal, *, reading="mode"):
+    def arrival(self, robot_state, goal, *, estimator="mode"):
         self.shapes.append(tuple(goal.shape))
         steps = torch.linalg.vector_norm(goal - robot_state[..., -3:], dim=-1) / SPEED
         return Arrival(steps, steps > 1000)
@@ -62,10 +61,18 @@ def observation(batch=(), step=0, dtype=torch.float32, seed=0):
     history = torch.rand(*batch, HISTORY, 3, generator=generator, dtype=dtype)
     tool = torch.rand(*batch, 3, generator=generator, dtype=dtype)
     entries = {
-        "target_history": history, "target_pos": history[..., -1, :], "tool_pos": tool, "robot_state": tool,
+        "target_history": history,
+        "target_pos": history[..., -1, :],
+        "tool_pos": tool,
+        "robot_state": tool,
         "step_count": torch.full(batch, step),
-    }  # fmt: skip
+    }
     return TensorDict(entries, batch_size=batch)
+
+
+def seen_by(planner, td):
+    """What ``planner`` sees in ``td``."""
+    return observe(td, planner.forecaster)
 
 
 def assert_same(one, other):
@@ -87,10 +94,14 @@ class ToyEnv(EnvBase):
         self.episode = torch.zeros(num_envs, dtype=torch.int64)
         n, integer = num_envs, torch.int64
         self.observation_spec = Composite(
-            robot_state=Unbounded((n, 3)), tool_pos=Unbounded((n, 3)), target_pos=Unbounded((n, 3)),
-            target_history=Unbounded((n, HISTORY, 3)), step_count=Unbounded((n,), dtype=integer),
-            episode=Unbounded((n,), dtype=integer), shape=(n,),
-        )  # fmt: skip
+            robot_state=Unbounded((n, 3)),
+            tool_pos=Unbounded((n, 3)),
+            target_pos=Unbounded((n, 3)),
+            target_history=Unbounded((n, HISTORY, 3)),
+            step_count=Unbounded((n,), dtype=integer),
+            episode=Unbounded((n,), dtype=integer),
+            shape=(n,),
+        )
         self.action_spec = Bounded(-1.0, 1.0, shape=(n, 3))
         self.reward_spec = Unbounded((n, 1))
         done = {key: Binary(shape=(n, 1), dtype=torch.bool) for key in ("done", "terminated", "truncated")}
@@ -122,7 +133,11 @@ class ToyEnv(EnvBase):
 
     def observe(self):
         entries = {
-            "robot_state": self.tool.clone(), "tool_pos": self.tool.clone(), "target_pos": self.trace[:, -1].clone(),
-            "target_history": self.trace.clone(), "step_count": self.steps.clone(), "episode": self.episode.clone(),
-        }  # fmt: skip
+            "robot_state": self.tool.clone(),
+            "tool_pos": self.tool.clone(),
+            "target_pos": self.trace[:, -1].clone(),
+            "target_history": self.trace.clone(),
+            "step_count": self.steps.clone(),
+            "episode": self.episode.clone(),
+        }
         return TensorDict(entries, batch_size=self.batch_size)

@@ -10,6 +10,7 @@ from torchrl.envs import EnvBase
 
 from torchdyn_plan import keys
 from torchdyn_plan.nets.policy import Actor, PolicyConfig
+from torchdyn_plan.training import GoalTask
 
 LENGTH, NEAR = 12, 0.1
 
@@ -62,11 +63,10 @@ class PointEnv(EnvBase):
         return TensorDict(entries | ends, batch_size=self.batch_size)
 
 
-class PointTask:
+class PointTask(GoalTask):
     """Reach the goal and stay; scored by where the points are at the end."""
 
     policy_config = PolicyConfig(robot_state_size=3, tool_slice=(0, 3), action_size=3, hidden=32, layers=2)
-    stored = ()
     length = LENGTH
 
     def make_env(self, num_envs: int, *, seed: int) -> PointEnv:

@@ -5,15 +5,15 @@ import json
 import torch
 from safetensors.torch import save_file
 
-from torchdyn_plan.envs.scene import TrapperScene
-from torchdyn_plan.nets.cushions import fold
+from torchdyn_plan.envs.trapper.scene import TrapperScene
+from torchdyn_plan.nets.reflection import reflect
 
 EXTENT = 0.7
 STEPS = 420
 
 
 def rolling_line(episodes=12, steps=STEPS, seed=0):
-    """Unfolded lines ``(E, T, 3)`` at constant velocity, no sample near a cushion's edge by accident."""
+    """Unreflected lines ``(E, T, 3)`` at constant velocity, no sample near a cushion's edge by accident."""
     draw = torch.Generator().manual_seed(seed)
     start = torch.rand(episodes, 1, 3, generator=draw, dtype=torch.float64) - 0.5
     step = (0.03 * torch.rand(episodes, 1, 3, generator=draw, dtype=torch.float64) - 0.015) * torch.tensor([1, 1, 0.0])
@@ -22,18 +22,18 @@ def rolling_line(episodes=12, steps=STEPS, seed=0):
     return line
 
 
-def write_paths(folder, *, sunk=(1, 4), digest=None, **settings):
-    """Shard and description of `rolling_line`, folded; episodes ``sunk`` end swallowed at sample 200."""
+def write_paths(folder, *, lost=(1, 4), digest=None, **settings):
+    """Shard and description of `rolling_line`, reflected; episodes ``lost`` end so at sample 200."""
     line = rolling_line(**settings)
-    path = torch.cat([fold(line[..., :2], EXTENT), line[..., 2:]], dim=-1).float()
+    path = torch.cat([reflect(line[..., :2], EXTENT), line[..., 2:]], dim=-1).float()
     parts = []
     for number, positions in enumerate(path):
-        parts.append(positions[:201].clone() if number in sunk else positions)
-        if number in sunk:
+        parts.append(positions[:201].clone() if number in lost else positions)
+        if number in lost:
             parts[-1][-1, 2] = -0.05
     length = torch.tensor([len(part) for part in parts])
     pocketed = torch.zeros(len(parts), dtype=torch.bool)
-    pocketed[list(sunk)] = True
+    pocketed[list(lost)] = True
     tensors = {
         "positions": torch.cat(parts),
         "length": length,

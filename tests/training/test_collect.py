@@ -1,85 +1,77 @@
+"""Shards of any task's data: what is in them, which are kept, and which are refused."""
+
 import json
+from dataclasses import replace
 
 import pytest
 import torch
 from safetensors import safe_open
 from safetensors.torch import load_file, save_file
 
-from torchdyn_plan.cli_arguments import CollectArguments
-from torchdyn_plan.envs import TrapperScene
-from torchdyn_plan.envs.episodes import draw_starts
-from torchdyn_plan.envs.reaching import ReachingTask
-from torchdyn_plan.errors import InputError
-from torchdyn_plan.planners import IKPlanner
-from torchdyn_plan.training import collect, runs
-from torchdyn_plan.training.arrivals import load_arrivals
-from torchdyn_plan.training.windows import load_paths
-
-SCENE = TrapperScene()
-PLAN = runs.trapper_runs(SCENE)
-STEPS = 200
+from tests.training.toy_task import SIZES, TASK, record_arrivals, record_paths
+from torchdyn_plan.errors import InputError, WeightsError
+from torchdyn_plan.nets import Actor
+from torchdyn_plan.tasks import load_task
+from torchdyn_plan.training import collect as module
+from torchdyn_plan.training.collect import SERIES, collect
 
 
-@pytest.fixture
+@pytest.fixture(autouse=True)
 def short(monkeypatch):
-    monkeypatch.setattr(collect, "PATH_STEPS", STEPS)
-    monkeypatch.setattr(collect, "SHARD", {"paths": 6, "arrivals": 24})
-    threads = torch.get_num_threads()
-    yield
-    torch.set_num_threads(threads)
+    monkeypatch.setattr(module, "SHARD", {"paths": 6, "arrivals": 24})
 
 
-def gather(out, what="paths", **settings):
-    settings = {"episodes": 10, "num_envs": 4, "threads": 1, **settings}
-    collect.collect(CollectArguments(what=what, out=out, **settings))
+def gather(out, what="paths", task=TASK, **settings):
+    collect(task, what, out, **{"episodes": 10, "num_envs": 4, "num_threads": 1, **settings})
     return [load_file(file) for file in sorted(out.glob(f"{what}-*.safetensors"))]
 
 
-@pytest.mark.usefixtures("short")
-def test_paths_are_cut_where_the_ball_is_swallowed_and_laid_end_to_end(tmp_path):
-    shards = gather(tmp_path)
-    assert [len(shard["length"]) for shard in shards] == [6, 4]
-    for shard in shards:
-        assert torch.equal(shard["start"], shard["length"].cumsum(0) - shard["length"])
-        assert shard["positions"].shape == (int(shard["length"].sum()), 3)
-        assert shard["positions"].dtype == torch.float32
-        for start, length, pocketed in zip(shard["start"], shard["length"], shard["pocketed"], strict=True):
-            height = shard["positions"][start : start + length, 2]
-            assert bool(pocketed) or length == STEPS + 1
-            assert (height[:-1] >= -SCENE.ball_radius).all()
-            assert bool(height[-1] < -SCENE.ball_radius) is bool(pocketed)
-    assert torch.cat([shard["pocketed"] for shard in shards]).any()
-    together = load_paths(tmp_path)
-    assert together.length.shape == (10,)
-    about = json.loads((tmp_path / "paths-0.json").read_text())
-    assert about["scene"] == SCENE.digest()
-    assert about["arguments"]["episodes"] == 10
+def test_paths_are_recorded_in_blocks_of_the_episodes_that_run_side_by_side(tmp_path):
+    asked = []
+
+    def record(blocks, **how):
+        asked.append([block.tolist() for block in blocks])
+        assert how == {"seed": 3, "num_threads": 1}
+        return record_paths(blocks, **how)
+
+    gather(tmp_path, task=replace(TASK, record_paths=record), seed=3)
+    assert asked == [[[0, 1, 2, 3], [4, 5]], [[6, 7, 8, 9]]]
 
 
-@pytest.mark.usefixtures("short")
-def test_paths_start_as_the_training_episodes_do_at_speeds_of_their_own(tmp_path):
-    gather(tmp_path, seed=3)
-    paths = load_paths(tmp_path)
-    place, direction = draw_starts(SCENE, torch.arange(10), velocity=1.0, split="train", seed=3)
-    first = paths.positions[paths.start]
-    torch.testing.assert_close(first[:, :2].double(), place, atol=1e-6, rtol=0)
-    speed = torch.cat([load_file(file)["velocity"] for file in sorted(tmp_path.glob("paths-*.safetensors"))])
-    assert ((speed >= 0) & (speed <= collect.FASTEST)).all()
-    assert len(speed.unique()) == 10
-    moved = (paths.positions[paths.start + 1] - first)[:, :2].double() / SCENE.control_step
-    torch.testing.assert_close(moved, direction * speed.unsqueeze(-1), atol=0.02, rtol=0)
+def test_arrivals_are_recorded_a_sequence_a_block_with_a_seed_a_shard(tmp_path):
+    asked = []
+
+    def record(planner, **how):
+        asked.append(how)
+        return record_arrivals(planner, **how)
+
+    gather(tmp_path, "arrivals", replace(TASK, record_arrivals=record), episodes=40, num_envs=8, seed=2)
+    shared = {"num_envs": 8, "num_threads": 1}
+    assert asked == [
+        shared | {"sequences": 3, "seed": 2 * SERIES},
+        shared | {"sequences": 2, "seed": 2 * SERIES + 1},
+    ]
 
 
-@pytest.mark.usefixtures("short")
-def test_paths_are_the_same_whatever_the_threads_and_others_with_another_seed(tmp_path):
-    one, two, other = gather(tmp_path / "1"), gather(tmp_path / "2", threads=2), gather(tmp_path / "3", seed=1)
-    for mine, same, different in zip(one, two, other, strict=True):
-        assert all(torch.equal(mine[name], same[name]) for name in mine)
-        assert not torch.equal(mine["velocity"], different["velocity"])
+def test_a_description_says_what_was_asked_for(tmp_path):
+    gather(tmp_path, "arrivals")
+    about = json.loads((tmp_path / "arrivals-0.json").read_text())
+    assert about["scene"] == "toy-1"
+    assert about["versions"]
+    assert about["arguments"] == {
+        "task": "toy",
+        "what": "arrivals",
+        "out": str(tmp_path),
+        "episodes": 10,
+        "seed": 0,
+        "num_envs": 4,
+        "num_threads": 1,
+        "static": "straight",
+        "weights": None,
+    }
 
 
-@pytest.mark.usefixtures("short")
-def test_shards_there_are_are_kept_but_not_one_that_was_cut_short(tmp_path):
+def test_shards_that_are_there_are_kept_but_not_one_that_was_cut_short(tmp_path):
     gather(tmp_path, episodes=8)
     first, last = sorted(tmp_path.glob("paths-*.safetensors"))
     with safe_open(first, "pt") as content:
@@ -88,87 +80,89 @@ def test_shards_there_are_are_kept_but_not_one_that_was_cut_short(tmp_path):
     assert list(shards[0]) == ["mark"]
     assert len(shards[1]["length"]) == 4
     stamp = last.stat().st_mtime_ns
-    gather(tmp_path, episodes=10, threads=2)
+    gather(tmp_path, episodes=10, num_threads=2)
     assert last.stat().st_mtime_ns == stamp
 
 
-@pytest.mark.usefixtures("short")
-def test_shards_of_another_collection_are_refused(tmp_path, monkeypatch):
+def test_shards_of_another_collection_are_refused(tmp_path):
     gather(tmp_path, episodes=6)
     with pytest.raises(InputError, match=r"paths-0-000.* num_envs is 4 there, 5 here"):
         gather(tmp_path, episodes=6, num_envs=5)
-    monkeypatch.setattr(collect, "TrapperScene", lambda: TrapperScene(ball_mass=5.0))
-    with pytest.raises(InputError, match=f"scene is {SCENE.digest()} there"):
-        gather(tmp_path, episodes=6)
+    with pytest.raises(InputError, match="scene is toy-1 there, toy-2 here"):
+        gather(tmp_path, task=replace(TASK, digest=lambda: "toy-2"), episodes=6)
     (tmp_path / "paths-0-000.safetensors").write_bytes(b"cut")
     with pytest.raises(InputError, match=r"paths-0-000.*not a whole safetensors file"):
         gather(tmp_path, episodes=6)
 
 
-@pytest.fixture(scope="module")
-def arrivals(tmp_path_factory):
-    """Samples of 24 sequences of runs, and those that stand at home at rest: at the start of a sequence."""
-    out = tmp_path_factory.mktemp("arrivals")
-    threads = torch.get_num_threads()
-    gather(out, "arrivals", episodes=48, num_envs=48)
-    torch.set_num_threads(threads)
-    data = load_arrivals(out)
-    home = (data.robot_state[:, :6] == torch.tensor(SCENE.home)).all(-1) & (data.robot_state[:, 6:12] == 0).all(-1)
-    return data, home
+def test_arrivals_of_another_planner_are_refused(tmp_path):
+    gather(tmp_path, "arrivals")
+    with pytest.raises(InputError, match="static is straight there, learned here"):
+        gather(tmp_path, "arrivals", static="learned")
 
 
-def test_arrivals_have_shapes_and_runs(arrivals):
-    data, home = arrivals
-    assert data.robot_state.shape == (len(data.run), 15)
-    assert data.arrival.dtype == data.run.dtype == torch.int64
-    names, counts = data.run.unique(return_counts=True)
-    assert (counts == runs.STATES_PER_RUN).all()
-    assert len(names) > 48
-    for run in names[:30]:
-        rows = data.run == run
-        assert len(data.goal[rows].unique(dim=0)) == 1
-        label = data.arrival[rows]
-        assert (label == -1).all() or ((label >= 0) & (label <= label[0])).all()
-    assert data.arrival.max() <= PLAN.longest
-    assert home.sum() >= 10
-    assert 0.02 < (data.arrival < 0).float().mean() < 0.6
+def test_a_persons_own_planner_drives_and_is_named(tmp_path):
+    def own(td):
+        return td
+
+    shards = gather(tmp_path, "arrivals", planner=own, name="mine")
+    assert all((shard["robot_state"] == 1.0).all() for shard in shards)
+    assert json.loads((tmp_path / "arrivals-0.json").read_text())["arguments"]["static"] == "mine"
 
 
-def test_the_label_is_what_a_new_run_from_home_takes(arrivals):
-    data, home = arrivals
-    rows = home.nonzero().squeeze(-1)[:24]
-    goal, label = data.goal[rows], data.arrival[rows]
-    assert (label > 20).any()
-    assert (label < 0).any()
-    task = ReachingTask(IKPlanner(), len(rows), num_threads=1)
-    found = torch.full_like(label, -1)
-    for step in range(PLAN.longest + 1):
-        found = torch.where((found < 0) & task.is_reached(goal), step, found)
-        task.step(goal)
-    assert torch.equal(found, label)
+def test_weights_of_a_policy_are_taken_and_noted(tmp_path):
+    one, other = (Actor(SIZES).save_pretrained(tmp_path / name / "policy") for name in ("one", "other"))
+    gather(tmp_path, "arrivals", static="learned", weights=tmp_path / "one")
+    about = json.loads((tmp_path / "arrivals-0.json").read_text())["arguments"]
+    assert about["weights"] == str(one)
+    gather(tmp_path, "arrivals", static="learned", weights=one)
+    with pytest.raises(InputError, match=r"weights is .* there, .* here"):
+        gather(tmp_path, "arrivals", static="learned", weights=other)
 
 
-def test_a_goal_beyond_the_rails_is_never_reached(arrivals):
-    data, _ = arrivals
-    beyond = (data.goal[:, :2].abs() > SCENE.half_side).any(-1)
-    assert beyond.sum() >= 10
-    assert (data.arrival[beyond] == -1).all()
-    assert (data.arrival[~beyond] >= 0).any()
+@pytest.mark.parametrize(
+    ("settings", "error", "message"),
+    [
+        ({"what": "path"}, InputError, r"unknown kind of data 'path' \(did you mean 'paths'\?\)"),
+        ({"what": "arrivals", "static": "ik"}, InputError, "unknown static planner of toy 'ik'"),
+        ({"episodes": 0}, InputError, "episodes must be >= 1, got 0"),
+        ({"seed": -1}, InputError, "seed must be >= 0"),
+        ({"weights": "there"}, InputError, "weights are of the task's own static planner"),
+        ({"what": "arrivals", "static": "learned", "weights": "nowhere"}, WeightsError, "no weights 'nowhere'"),
+        ({"task": replace(TASK, record_paths=None)}, InputError, "toy records no paths"),
+        ({"what": "arrivals", "task": replace(TASK, record_arrivals=None)}, InputError, "toy records no arrivals"),
+    ],
+)
+def test_what_cannot_be_collected_is_named_and_nothing_is_written(tmp_path, settings, error, message):
+    if settings.get("weights") == "there":
+        settings = settings | {"weights": Actor(SIZES).save_pretrained(tmp_path / "policy")}
+    out = tmp_path / "out"
+    with pytest.raises(error, match=message):
+        gather(out, **settings)
+    assert not out.exists()
 
 
-def test_goals_lie_on_the_table_above_it_and_outside():
-    goal = runs.draw_goals(SCENE, 4000, torch.Generator().manual_seed(0))
-    assert goal.shape == (4000, 3)
-    inside = (goal[:, :2].abs() <= SCENE.half_side).all(-1)
-    height = goal[:, 2]
-    on_table = (height - SCENE.ball_radius).abs() <= 0.005
-    above = height > SCENE.ball_radius + 0.01
-    sunk = height <= 0
-    assert (on_table | above | sunk).all()
-    for kind, low in ((inside & on_table, 0.3), (inside & above, 0.1), (inside & sunk, 0.01), (~inside, 0.03)):
-        assert low < kind.float().mean() < 0.8
-    assert goal[:, :2].abs().amax() > 2.5
-    near = (goal[:, :2] - torch.tensor(SCENE.base_pos[:2])).norm(dim=-1) < 0.9
-    assert (near & on_table).float().mean() > 0.2
-    for half in (goal[:, 0] < 0, goal[:, 0] > 0):
-        assert 0.4 < half.float().mean() < 0.6
+def test_weights_for_a_planner_that_has_none_are_refused(tmp_path):
+    weights = Actor(SIZES).save_pretrained(tmp_path / "policy")
+    with pytest.raises(InputError, match="weights are of a policy, but straight of toy is none"):
+        gather(tmp_path, "arrivals", weights=weights)
+
+
+def test_the_number_of_torchs_threads_is_put_back(tmp_path):
+    before = torch.get_num_threads()
+    gather(tmp_path)
+    assert torch.get_num_threads() == before
+
+
+def test_data_of_one_task_is_not_taken_for_anothers(tmp_path):
+    gather(tmp_path, "arrivals", episodes=4)
+    with pytest.raises(InputError, match="scene is toy-1 there"):
+        collect(load_task("trapper"), "arrivals", tmp_path, episodes=4, num_envs=4, num_threads=1)
+
+
+def test_a_recorder_that_leaves_something_out_is_named(tmp_path):
+    def record(blocks, **how):
+        return {name: value for name, value in record_paths(blocks, **how).items() if name not in ("start", "length")}
+
+    with pytest.raises(InputError, match="what toy records of paths lacks start, length"):
+        gather(tmp_path, task=replace(TASK, record_paths=record))

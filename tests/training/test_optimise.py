@@ -54,14 +54,14 @@ def test_an_interrupted_fit_ends_bit_identical(tmp_path, fail_at):
     assert all(torch.equal(one[name], other[name]) for name in one)
 
 
-def test_a_finished_fit_is_not_repeated_and_one_without_resume_starts_anew(tmp_path):
+def test_a_finished_fit_is_not_repeated_and_one_without_resume_starts_over(tmp_path):
     network, curve, _ = fit(tmp_path)
     again, same, calls = fit(tmp_path)
     assert (calls, same) == (0, curve)
     assert torch.equal(again.weight, network.weight)
-    anew, same, calls = fit(tmp_path, resume=False)
+    fresh, same, calls = fit(tmp_path, resume=False)
     assert (calls, same) == (40, curve)
-    assert torch.equal(anew.weight, network.weight)
+    assert torch.equal(fresh.weight, network.weight)
 
 
 @pytest.mark.parametrize(

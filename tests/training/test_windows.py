@@ -3,8 +3,8 @@ import torch
 
 from tests.training.rolling import EXTENT, write_paths
 from torchdyn_plan.errors import InputError
-from torchdyn_plan.nets.cushions import fold
-from torchdyn_plan.training.lines import unfold_paths
+from torchdyn_plan.nets.reflection import reflect
+from torchdyn_plan.training.lines import unreflect_paths
 from torchdyn_plan.training.windows import (
     WindowConfig,
     cut_windows,
@@ -28,7 +28,7 @@ def test_a_window_by_hand(paths):
     first = int(paths.start[2])
     assert torch.equal(windows.history[0], paths.positions[first + 7 : first + 31])
     assert torch.equal(windows.future[0], paths.positions[first + 31 : first + 81])
-    assert (windows.history_length.item(), windows.pocketed.item(), windows.moving.item()) == (24, False, True)
+    assert (windows.history_length.item(), windows.lost.item(), windows.moving.item()) == (24, False, True)
 
 
 def test_padding_repeats_the_first_sample(paths):
@@ -38,16 +38,16 @@ def test_padding_repeats_the_first_sample(paths):
     assert torch.equal(windows.history[0, :10], paths.positions[first].expand(10, 3))
 
 
-def test_a_swallowed_target_stays_and_is_told(paths):
+def test_a_lost_target_stays_and_is_marked(paths):
     windows = cut_windows(paths, torch.tensor([1, 1]), torch.tensor([180, 40]), torch.tensor([24, 24]), CONFIG)
-    assert windows.pocketed.tolist() == [True, False]
+    assert windows.lost.tolist() == [True, False]
     assert windows.recorded[0].tolist() == [True] * 20 + [False] * 30
     assert torch.equal(windows.future[0, 20:], windows.future[0, 19].expand(30, 3))
     assert windows.recorded[1].all()
 
 
-def test_unfolded_futures_fold_to_the_futures(paths):
-    lines = unfold_paths(paths.positions, paths.start, EXTENT)
+def test_unreflected_futures_reflect_to_the_futures(paths):
+    lines = unreflect_paths(paths.positions, paths.start, EXTENT)
     last = last_useful_step(paths, CONFIG)
     episodes = torch.arange(12).repeat(40)
     plain, line = (
@@ -55,7 +55,7 @@ def test_unfolded_futures_fold_to_the_futures(paths):
         for given in (None, lines)
     )
     assert torch.equal(plain.history, line.history)
-    torch.testing.assert_close(fold(line.future[..., :2], EXTENT), plain.future[..., :2], atol=1e-5, rtol=0)
+    torch.testing.assert_close(reflect(line.future[..., :2], EXTENT), plain.future[..., :2], atol=1e-5, rtol=0)
     step = line.future[..., 0, :2] - line.history[..., -1, :2]
     # However the table lies, the line goes on from where the target is now.
     assert step.abs().max() < 2 * 0.015
@@ -65,7 +65,7 @@ def test_draws_stay_within_the_recording(paths):
     last = last_useful_step(paths, CONFIG)
     windows = draw_windows(paths, last, torch.arange(12).repeat(200), CONFIG, torch.Generator().manual_seed(0))
     assert bool((windows.history_length >= 13).all())
-    assert windows.recorded[~windows.pocketed].all()
+    assert windows.recorded[~windows.lost].all()
     assert 0.2 < (windows.history_length < 24).float().mean() < 0.5
 
 

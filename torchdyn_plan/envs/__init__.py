@@ -1,17 +1,48 @@
-"""Simulated tasks: MuJoCo scenes, batched simulation, TorchRL environments."""
+"""Simulated worlds as TorchRL environments; those of a task lie in its folder, and are imported when asked for."""
 
-from torchdyn_plan.envs.fetch import FetchSimulation
-from torchdyn_plan.envs.goals import TrapperGoalEnv
-from torchdyn_plan.envs.reach import DynamicReachEnv
-from torchdyn_plan.envs.scene import TrapperScene
-from torchdyn_plan.envs.simulation import TrapperSimulation
-from torchdyn_plan.envs.trapper import TrapperEnv
+from __future__ import annotations
+
+from importlib import import_module
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from torchdyn_plan.envs.arm_runner import ArmRunner, EnvRunner
+    from torchdyn_plan.envs.episodes import draw_uniform
+    from torchdyn_plan.envs.fetch_reach import DynamicReachEnv, FetchSimulation
+    from torchdyn_plan.envs.moving_target import MovingTargetEnv, RobotReading
+    from torchdyn_plan.envs.trapper import TrapperEnv, TrapperGoalEnv, TrapperScene, TrapperSimulation
+
+_PLACES = {
+    "ArmRunner": "arm_runner",
+    "DynamicReachEnv": "fetch_reach",
+    "EnvRunner": "arm_runner",
+    "FetchSimulation": "fetch_reach",
+    "MovingTargetEnv": "moving_target",
+    "RobotReading": "moving_target",
+    "TrapperEnv": "trapper",
+    "TrapperGoalEnv": "trapper",
+    "TrapperScene": "trapper",
+    "TrapperSimulation": "trapper",
+    "draw_uniform": "episodes",
+}
+"""Module of this folder that defines each name."""
 
 __all__ = [
+    "ArmRunner",
     "DynamicReachEnv",
+    "EnvRunner",
     "FetchSimulation",
+    "MovingTargetEnv",
+    "RobotReading",
     "TrapperEnv",
     "TrapperGoalEnv",
     "TrapperScene",
     "TrapperSimulation",
+    "draw_uniform",
 ]
+
+
+def __getattr__(name: str) -> Any:
+    if name not in _PLACES:
+        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+    return getattr(import_module(f"{__name__}.{_PLACES[name]}"), name)

@@ -1,25 +1,28 @@
-"""How an episode starts: a pure function of its split, seed and index."""
+"""Episodes by number: how one starts is a pure function of its split, its seed and its index."""
+
+from __future__ import annotations
 
 import numpy as np
 import torch
 from torch import Tensor
 
 from torchdyn_plan.checks import check_choice
-from torchdyn_plan.envs.scene import TrapperScene
 
 SPLITS = {"test": 0, "dev": 1, "train": 2}
 """Tuning sees ``dev`` only, networks learn from ``train``, and results are reported on ``test``."""
 
 
-def draw_starts(
-    scene: TrapperScene, indices: Tensor, *, velocity: float, split: str, seed: int
-) -> tuple[Tensor, Tensor]:
-    """Ball position and velocity, ``(M, 2)`` float64 each [m, m/s], of the episodes ``indices`` (M,).
+def episode_random(split: str, seed: int, episode: int, *stream: int) -> np.random.Generator:
+    """The random generator of an episode; another ``stream`` is for what is drawn beside its start.
 
-    The place is uniform over the table. The components of the velocity are uniform within ±``velocity`` ("randomly
-    selecting the x and y components", paper, Section IV).
+    Raises:
+        InputError: the split is unknown.
     """
     check_choice("split", split, SPLITS)
-    draws = np.stack([np.random.default_rng((SPLITS[split], seed, int(i))).uniform(-1.0, 1.0, 4) for i in indices])
-    room = scene.half_side - scene.ball_radius - 0.005
-    return torch.from_numpy(draws[:, :2] * room), torch.from_numpy(draws[:, 2:] * velocity)
+    return np.random.default_rng((SPLITS[split], seed, episode, *stream))
+
+
+def draw_uniform(episodes: Tensor, count: int, *, split: str, seed: int) -> Tensor:
+    """``count`` numbers of each of ``episodes`` (M,), uniform within ±1: ``(M, count)`` float64."""
+    draws = [episode_random(split, seed, episode).uniform(-1.0, 1.0, count) for episode in episodes.tolist()]
+    return torch.from_numpy(np.stack(draws))

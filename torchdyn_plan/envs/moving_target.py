@@ -3,103 +3,141 @@
 from __future__ import annotations
 
 from abc import abstractmethod
-from typing import Any
+from collections.abc import Callable
+from typing import Any, ClassVar, NamedTuple
 
 import torch
 from tensordict import TensorDict, TensorDictBase
 from torch import Tensor
-from torchrl.data import Binary, Bounded, Composite, Unbounded
+from torchrl.data import Bounded, Composite, Unbounded
 from torchrl.envs import EnvBase
 
 from torchdyn_plan import keys
 from torchdyn_plan.checks import check_choice, check_finite, check_number, check_trailing_shape
 from torchdyn_plan.envs.episodes import SPLITS
+from torchdyn_plan.envs.specs import flag_spec, observation_spec
+from torchdyn_plan.errors import InputError
+
+ENDS = ("done", "terminated", "truncated")
+"""Keys that tell whether an episode has ended."""
+
+
+class RobotReading(NamedTuple):
+    """What N robots' sensors read, float32; the environment changes none of these tensors in place afterwards."""
+
+    tool_pos: Tensor
+    """``(N, 3)`` [m, world]."""
+    state: Tensor
+    """``(N, S)``: what a policy and an arrival model read, the tool's place among it."""
+    joint_pos: Tensor | None = None
+    """``(N, joints)`` [rad]; None for a robot without joints."""
+    joint_vel: Tensor | None = None
+    """``(N, joints)`` [rad/s]; None for a robot without joints."""
 
 
 class MovingTargetEnv(EnvBase):
     """N independent episodes of a robot and a target, ``batch_size [num_envs]``, on the CPU.
 
-    Entries are those of `torchdyn_plan.keys`. A task says how an episode starts (`_start`), what is seen beside the
-    target (`_robot`, `_flags`), and what a step does (`_step`). How episode i starts is a pure function of
-    (split, seed, i): environments take the next index when they reset, so that the same actions give bit-identical
-    episodes whatever ``num_envs``.
+    Entries are those of `torchdyn_plan.keys` and the task's own `flags`. A task says how an episode starts (`_start`),
+    what a control step does (`_advance`), what the robot's sensors read (`_robot`), and what has happened (`_flags`);
+    by default any flag ends an episode, and the reward is 1 where the first one holds. How episode i starts must be a
+    pure function of (split, seed, i), as `torchdyn_plan.envs.episodes.draw_uniform` draws it: environments take the
+    next index when they reset, so that the same actions give bit-identical episodes whatever ``num_envs``.
     """
+
+    flags: ClassVar[tuple[str, ...]] = ()
+    """Keys of what the task tells beside, bool ``(N, 1)`` each; the first one is success."""
+    scene_digest: str | None = None
+    """Hash of the scene, which a planner that was made for one must share; None if there is nothing to confuse."""
 
     def __init__(
         self,
-        num_envs: int,
+        num_envs: int = 1,
         *,
-        joints: int,
         state_size: int,
         action_size: int,
-        flags: tuple[str, ...],
-        static: bool,
-        seed: int,
-        split: str,
-        history: int,
-        max_steps: int,
+        joints: int = 0,
+        static_target: bool = False,
+        seed: int = 0,
+        split: str = "train",
+        history: int = 24,
+        max_steps: int = 500,
     ) -> None:
         """Declare the keys, with nothing started yet.
 
         Args:
             num_envs: number of episodes that run side by side.
-            joints: number of the robot's joints.
             state_size: size S of the robot state.
-            action_size: size A of an action.
-            flags: keys of what the task tells beside, bool ``(N, 1)`` each.
-            static: the target rests, and `goal` says where.
+            action_size: size A of an action, each entry within ±1.
+            joints: number of the robot's joints.
+            static_target: the target rests, and `goal` says where.
             seed: which series of episodes.
             split: ``train``, ``dev`` or ``test``: series that never share an episode.
             history: length H of `target_history`, in control steps.
-            max_steps: steps after which an episode is truncated.
+            max_steps: control steps after which an episode is truncated.
 
         Raises:
-            InputError: a number is negative, NaN or of the wrong kind, or the split is unknown.
+            InputError: a number is negative, NaN or of the wrong kind, the split is unknown, or the class has no flags.
         """
+        if not self.flags:
+            raise InputError(f"{type(self).__name__}.flags must name at least what success is called")
         for name, value, minimum in (("num_envs", num_envs, 1), ("history", history, 2), ("max_steps", max_steps, 1)):
             check_number(name, value, minimum=minimum, integer=True)
         check_number("seed", seed, minimum=0, integer=True)
         check_choice("split", split, SPLITS)
         super().__init__(device=torch.device("cpu"), batch_size=torch.Size([num_envs]))
-        self.static, self.seed, self.split, self.max_steps, self.history = static, seed, split, max_steps, history
+        self.static_target, self.history, self.max_steps = static_target, history, max_steps
+        self.seed, self.split = seed, split
         self._next_episode = 0
         self._episode = torch.zeros(num_envs, dtype=torch.int64)
+        # TorchRL's StepCounter and CatFrames would do the next two, at several times the cost of a step.
         self._steps = torch.zeros(num_envs, dtype=torch.int64)
         self._trace = torch.zeros(num_envs, history, 3)
-        self._make_specs(joints, state_size, action_size, flags)
-
-    def _make_specs(self, joints: int, state_size: int, action_size: int, flags: tuple[str, ...]) -> None:
-        n = self.num_envs
-        vectors = {
-            keys.JOINT_POS: (joints,), keys.JOINT_VEL: (joints,), keys.TOOL_POS: (3,), keys.TARGET_POS: (3,),
-            keys.TARGET_HISTORY: (self.history, 3), keys.ROBOT_STATE: (state_size,), keys.OBSERVATION: (state_size,),
-            keys.ACHIEVED_GOAL: (3,), keys.DESIRED_GOAL: (3,),
-        }  # fmt: skip
-        if self.static:
-            vectors[keys.GOAL] = (3,)
-        one = torch.Size((n, 1))
-        specs: dict[str, Any] = {key: Unbounded(torch.Size((n, *shape))) for key, shape in vectors.items()}
-        for key in (keys.HISTORY_LENGTH, keys.STEP_COUNT, keys.EPISODE):
-            specs[key] = Unbounded(self.batch_size, dtype=torch.int64)
-        for key in flags:
-            specs[key] = Binary(shape=one, dtype=torch.bool)
-        self.observation_spec = Composite(specs, shape=(n,))
-        self.action_spec = Bounded(-1.0, 1.0, shape=torch.Size((n, action_size)))
-        self.reward_spec = Unbounded(one)
-        done = {key: Binary(shape=one, dtype=torch.bool) for key in ("done", "terminated", "truncated")}
-        self.done_spec = Composite(done, shape=(n,))
+        self.observation_spec = observation_spec(
+            num_envs,
+            joints=joints,
+            state_size=state_size,
+            history=history,
+            flags=self.flags,
+            static_target=static_target,
+        )
+        self.action_spec = Bounded(-1.0, 1.0, shape=torch.Size((num_envs, action_size)))
+        self.reward_spec = Unbounded(torch.Size((num_envs, 1)))
+        self.done_spec = Composite({key: flag_spec(num_envs) for key in ENDS}, shape=(num_envs,))
 
     @abstractmethod
     def _start(self, rows: Tensor, episodes: Tensor) -> Tensor:
         """Start ``episodes`` (M,) in ``rows`` (M,); returns where their targets are, ``(M, 3)`` float32 [m, world]."""
 
     @abstractmethod
-    def _robot(self) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-        """Joint angles and speeds ``(N, joints)``, place of the tool ``(N, 3)`` and robot state ``(N, S)``, float32."""
+    def _advance(self, action: Tensor) -> Tensor:
+        """Let a control step pass under ``action`` (N, A); returns where targets are then, ``(N, 3)`` float32 [m]."""
+
+    @abstractmethod
+    def _robot(self) -> RobotReading:
+        """What the robots' sensors read now."""
 
     @abstractmethod
     def _flags(self) -> dict[str, Tensor]:
-        """What the task tells beside, bool ``(N,)`` each."""
+        """What has happened, bool ``(N,)`` for each of `flags`."""
+
+    def _reward(self, observed: TensorDict) -> Tensor:
+        """Rewards ``(N, 1)`` of a step after which ``observed`` is seen: 1 where the first flag holds."""
+        return observed[self.flags[0]].float()
+
+    def _terminated(self, observed: TensorDict) -> Tensor:
+        """Whether an episode ends of itself, ``(N, 1)`` bool: where any flag holds."""
+        return torch.stack([observed[flag] for flag in self.flags]).any(0)
+
+    @property
+    def target_pos(self) -> Tensor:
+        """Where targets are now, ``(N, 3)`` [m, world]."""
+        return self._trace[:, -1]
+
+    @property
+    def step_count(self) -> Tensor:
+        """Control steps since the reset, ``(N,)`` int64; in `_advance` those before the one that passes."""
+        return self._steps
 
     def start_from(self, episode: int) -> None:
         """Let the next reset take episode number ``episode``, and later ones the numbers after it."""
@@ -116,6 +154,22 @@ class MovingTargetEnv(EnvBase):
         """Number of episodes that run side by side."""
         return self.batch_size[0]
 
+    def check_planner(self, planner: Callable[..., Any]) -> None:
+        """Raise `InputError` if ``planner`` was made for another scene, by the digest in its ``scene``."""
+        # Any function may be a planner: only those that belong to a scene say so.
+        scene = getattr(planner, "scene", None)
+        if self.scene_digest is not None and isinstance(scene, str) and scene != self.scene_digest:
+            raise InputError(
+                f"the planner belongs to scene {scene}, but the environment's scene is {self.scene_digest}: make a "
+                "planner for this scene (one that is made with scene=None belongs to none)"
+            )
+
+    def rollout(self, max_steps: int, policy: Callable[..., Any] | None = None, *args: Any, **kwargs: Any) -> Any:
+        """As TorchRL's; raises `InputError` for a planner of another scene (`check_planner`)."""
+        if policy is not None:
+            self.check_planner(policy)
+        return super().rollout(max_steps, policy, *args, **kwargs)
+
     def _set_seed(self, seed: int | None) -> None:
         """Start the series ``seed`` at its first episode."""
         self.seed, self._next_episode = seed or 0, 0
@@ -131,8 +185,16 @@ class MovingTargetEnv(EnvBase):
             self._trace = self._trace.clone()
             self._trace[rows] = self._start(rows, episodes).unsqueeze(1)
         result = self._observe()
-        for key in ("done", "terminated", "truncated"):
+        for key in ENDS:
             result[key] = torch.zeros(self.num_envs, 1, dtype=torch.bool)
+        return result
+
+    def _step(self, tensordict: TensorDictBase) -> TensorDict:
+        self._see(self._advance(self._checked_action(tensordict)))
+        result = self._observe()
+        terminated, truncated = self._terminated(result), self._is_over
+        result["reward"] = self._reward(result)
+        result["terminated"], result["truncated"], result["done"] = terminated, truncated, terminated | truncated
         return result
 
     def _checked_action(self, tensordict: TensorDictBase) -> Tensor:
@@ -164,15 +226,24 @@ class MovingTargetEnv(EnvBase):
         return tensordict, TensorDict(entries, batch_size=self.batch_size, device=self.device)
 
     def _observe(self) -> TensorDict:
-        joint_pos, joint_vel, tool, state = self._robot()
-        target = self._trace[:, -1]
+        robot, target = self._robot(), self.target_pos
         entries = {
-            keys.JOINT_POS: joint_pos, keys.JOINT_VEL: joint_vel, keys.TOOL_POS: tool, keys.TARGET_POS: target,
-            keys.TARGET_HISTORY: self._trace, keys.HISTORY_LENGTH: self._steps.clamp(max=self.history),
-            keys.ROBOT_STATE: state, keys.OBSERVATION: state, keys.ACHIEVED_GOAL: tool, keys.DESIRED_GOAL: target,
-            keys.STEP_COUNT: self._steps.clone(), keys.EPISODE: self._episode.clone(),
-        }  # fmt: skip
+            keys.TOOL_POS: robot.tool_pos,
+            keys.TARGET_POS: target,
+            keys.TARGET_HISTORY: self._trace,
+            keys.HISTORY_LENGTH: self._steps.clamp(max=self.history),
+            keys.ROBOT_STATE: robot.state,
+            keys.OBSERVATION: robot.state,
+            keys.ACHIEVED_GOAL: robot.tool_pos,
+            keys.DESIRED_GOAL: target,
+            keys.STEP_COUNT: self._steps.clone(),
+            keys.EPISODE: self._episode.clone(),
+        }
+        if robot.joint_pos is not None:
+            entries[keys.JOINT_POS] = robot.joint_pos
+        if robot.joint_vel is not None:
+            entries[keys.JOINT_VEL] = robot.joint_vel
         entries |= {key: flag.unsqueeze(-1) for key, flag in self._flags().items()}
-        if self.static:
+        if self.static_target:
             entries[keys.GOAL] = target
         return TensorDict(entries, batch_size=self.batch_size, device=self.device)

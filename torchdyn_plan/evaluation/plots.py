@@ -1,120 +1,126 @@
 """Figures of results, beside the paper's. matplotlib is imported where a figure is drawn."""
 
-from collections.abc import Mapping, Sequence
+from __future__ import annotations
+
+import textwrap
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import fields
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 from torchdyn_plan.evaluation.intervals import Rate
-from torchdyn_plan.evaluation.paper import Sweep, paper_curve, paper_reach
+from torchdyn_plan.evaluation.report import describe_setting, unit_of
 from torchdyn_plan.evaluation.results import ResultRow
 from torchdyn_plan.files import write_whole
+from torchdyn_plan.tasks.task import Task
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
-COLOURS = {
-    "pursuit": "#D55E00",
-    "corner": "#0072B2",
-    "oracle": "#009E73",
-    "exact": "#CC79A7",
-    "meet": "#E69F00",
-    "wait": "#56B4E9",
-    "dher": "#56B4E9",
-}
-"""The colour of each planner: the palette of Okabe and Ito, told apart by colour-blind readers too."""
 
-MARKERS = {
-    "pursuit": "s", "corner": "o", "oracle": "^", "exact": "D", "meet": "v", "wait": "P", "dher": "P",
-}  # fmt: skip
+class Style(NamedTuple):
+    """How a planner is drawn."""
+
+    colour: str
+    marker: str
+
+
+STYLES = {
+    "pursuit": Style("#D55E00", "s"),
+    "corner": Style("#0072B2", "o"),
+    "oracle": Style("#009E73", "^"),
+    "exact": Style("#CC79A7", "D"),
+    "wait": Style("#56B4E9", "P"),
+}
+"""Of planners that most tasks have: the palette of Okabe and Ito, which colour-blind readers can tell apart, too."""
+FURTHER_STYLES = (Style("#E69F00", "v"), Style("#000000", "X"), Style("#8C6D31", "<"), Style("#7F7F7F", ">"))
+"""Of a task's own planners, in their order, and of those given by hand."""
+
+TITLE_WIDTH = 105
+"""Characters of a title in a line."""
 
 _GREY = "#555555"
 _PALETTE = ("#0072B2", "#56B4E9", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#000000")
-_PANELS = (("all episodes", False), ("solvable episodes", True))
-_REACH_AXIS = "velocity of the goal [m per control step]"
-_AXES = {"velocity": "velocity of the ball [m/s]", "friction": "friction loss of the ball [N]"}
 
 
-def plot_results(rows: Sequence[ResultRow], path: Path) -> None:
+class _Panel(NamedTuple):
+    """What a panel shows."""
+
+    title: str
+    solvable: bool
+
+    def rate(self, row: ResultRow) -> Rate | None:
+        value = row.success_solvable if self.solvable else row.success
+        return None if value is None else Rate(value, *(row.success_solvable_ci if self.solvable else row.success_ci))
+
+    def paper(self, row: ResultRow) -> float | None:
+        return row.paper_success_solvable if self.solvable else row.paper_success
+
+
+def plot_results(task: Task, rows: Sequence[ResultRow], path: Path) -> None:
     """Success of each planner with its 95 % interval and the paper's figure, over all and over solvable episodes.
 
     Args:
+        task: whose results these are.
         rows: one row a planner, all at one setting.
         path: file to write; its ending chooses the format.
 
     Raises:
         OutputError: the file cannot be written.
     """
-    figure, panels = _panels(height=1.5 + 0.5 * len(rows))
-    for axes, (title, solvable) in zip(panels, _PANELS, strict=True):
+    panels = _panels_of(task)
+    figure, all_axes = _axes(height=1.5 + 0.5 * len(rows), count=len(panels))
+    styles = _styles(task, [row.planner for row in rows])
+    for axes, panel in zip(all_axes, panels, strict=True):
         for line, row in enumerate(rows):
-            _draw_row(axes, line, row, solvable)
-        axes.set(title=title, xlim=(0, 1), xlabel="success rate", ylim=(len(rows) - 0.5, -0.5))
+            _draw_row(axes, line, styles[row.planner].colour, panel.rate(row), panel.paper(row))
+        axes.set(title=panel.title, xlim=(0, 1), xlabel="success rate", ylim=(len(rows) - 0.5, -0.5))
         axes.set_yticks(range(len(rows)), [row.planner for row in rows])
         axes.grid(axis="x", alpha=0.3)
     if any(row.paper_success is not None for row in rows):
-        panels[0].plot([], [], "|", color=_GREY, markersize=10, markeredgewidth=2, label="paper")
+        all_axes[0].plot([], [], "|", color=_GREY, markersize=10, markeredgewidth=2, label="paper")
         figure.legend(loc="outside lower center", frameon=False)
-    row = rows[0]
-    unit = "m a step" if row.task == "reach" else f"m/s, friction {row.friction:g}"
-    figure.suptitle(f"{row.task}, {row.static} planner, {row.velocity:g} {unit}, {row.episodes} episodes")
+    _set_title(figure, task, rows[0], list(rows[0].settings))
     _save(figure, path)
 
 
-def plot_sweep(rows: Sequence[ResultRow], over: Sweep, path: Path) -> None:
-    """Success over velocity or friction, a curve a planner with its 95 % band, the paper's curves dashed.
+def plot_sweep(task: Task, rows: Sequence[ResultRow], over: str, path: Path) -> None:
+    """Success over a setting: a curve a planner with its 95 % band, and the paper's curves dashed.
+
+    Where a task knows which episodes can be solved, a grey line shows their share, which no planner can be above.
 
     Args:
+        task: whose results these are.
         rows: one row for each planner and value.
-        over: ``velocity`` or ``friction``, the axis.
+        over: the setting along the axis.
         path: file to write; its ending chooses the format.
 
     Raises:
         OutputError: the file cannot be written.
     """
-    figure, panels = _panels(height=4.2)
-    for axes, (title, solvable) in zip(panels, _PANELS, strict=True):
-        for planner in dict.fromkeys(row.planner for row in rows):
-            mine = sorted((row for row in rows if row.planner == planner), key=lambda row: getattr(row, over))
-            _draw_curve(axes, mine, over, solvable)
-        axes.set(title=title, ylim=(0, 1), xlabel=_AXES[over])
+    panels = _panels_of(task)
+    figure, all_axes = _axes(height=4.2, count=len(panels))
+    planners = list(dict.fromkeys(row.planner for row in rows))
+    styles = _styles(task, planners)
+    if task.truth is not None:
+        shares = sorted({(row.settings[over], row.solvable) for row in rows})
+        all_axes[0].plot(*zip(*shares, strict=True), color=_GREY, linewidth=3, alpha=0.4, label="solvable")
+    for axes, panel in zip(all_axes, panels, strict=True):
+        for planner in planners:
+            _draw_curve(axes, [row for row in rows if row.planner == planner], over, panel, styles[planner])
+        _draw_paper(axes, task, rows[0], over, panel)
+        axes.set(title=panel.title, ylim=(0, 1.02), xlabel=_axis(task, over))
         axes.grid(alpha=0.3)
-    panels[0].set_ylabel("success rate")
-    panels[0].plot([], [], "--", color=_GREY, label="paper")
-    handles, labels = panels[0].get_legend_handles_labels()
-    figure.legend(handles, labels, loc="outside lower center", ncols=len(labels), frameon=False)
-    _save(figure, path)
-
-
-def plot_reach(rows: Sequence[ResultRow], path: Path) -> None:
-    """Success on Reach over the goal's velocity beside the paper's Figure 5: its planner and DHER dashed.
-
-    The grey line is the ceiling: the share of episodes that a search which knows the goal's path solves.
-
-    Args:
-        rows: one row for each planner and velocity.
-        path: file to write; its ending chooses the format.
-
-    Raises:
-        OutputError: the file cannot be written.
-    """
-    figure, (axes,) = _panels(height=4.6, count=1)
-    ceiling = sorted({(row.velocity, row.solvable) for row in rows})
-    axes.plot(*zip(*ceiling, strict=True), color=_GREY, linewidth=3, alpha=0.4, label="ceiling")
-    for planner in dict.fromkeys(row.planner for row in rows):
-        mine = sorted((row for row in rows if row.planner == planner), key=lambda row: row.velocity)
-        _draw_curve(axes, mine, "velocity", solvable=False)
-    if rows[0].motion == "straight":
-        for method, colour, name in (("dynamic", COLOURS["corner"], "paper"), ("dher", _GREY, "paper, DHER")):
-            axes.plot(*paper_reach(method), "--", color=colour, linewidth=1.2, label=name)
-    axes.set(title=f"Reach, goals move: {rows[0].motion}", ylim=(0, 1.02), xlabel=_REACH_AXIS, ylabel="success rate")
-    axes.grid(alpha=0.3)
-    figure.legend(loc="outside right center", frameon=False)
+    all_axes[0].set_ylabel("success rate")
+    handles, labels = all_axes[0].get_legend_handles_labels()
+    figure.legend(handles, labels, loc="outside lower center", ncols=min(len(labels), 8), frameon=False)
+    _set_title(figure, task, rows[0], [name for name in rows[0].settings if name != over])
     _save(figure, path)
 
 
 def plot_bench(rows: Sequence[Mapping[str, Any]], path: Path) -> None:
-    """Median time for one item over the batch, a panel for each task and a line for each implementation.
+    """Median time for one item over the batch, a panel for each piece of work and a line for each implementation.
 
     Args:
         rows: those of a benchmark.
@@ -123,19 +129,20 @@ def plot_bench(rows: Sequence[Mapping[str, Any]], path: Path) -> None:
     Raises:
         OutputError: the file cannot be written.
     """
-    tasks = [task for task in dict.fromkeys(row["what"] for row in rows) if _batches(rows, task) > 1]
-    kinds = list(dict.fromkeys(_implementation(row) for row in rows if row["what"] in tasks))
-    figure, panels = _panels(height=4.6, count=len(tasks))
-    for axes, task in zip(panels, tasks, strict=True):
+    batches: dict[str, set[int]] = {}
+    for row in rows:
+        batches.setdefault(row["what"], set()).add(row["batch"])
+    works = [work for work, sizes in batches.items() if len(sizes) > 1]
+    kinds = list(dict.fromkeys(_implementation(row) for row in rows if row["what"] in works))
+    figure, all_axes = _axes(height=4.6, count=len(works))
+    for axes, work in zip(all_axes, works, strict=True):
         for index, kind in enumerate(kinds):
-            mine = [row for row in rows if row["what"] == task and _implementation(row) == kind]
-            x, y = [row["batch"] for row in mine], [row["median_us"] / row["batch"] for row in mine]
-            style = "--" if "compiled" in kind else "-"
-            axes.loglog(x, y, style, color=_PALETTE[index % len(_PALETTE)], marker="o", markersize=4, label=kind)
-        axes.set(title=task, xlabel="batch")
+            mine = [row for row in rows if row["what"] == work and _implementation(row) == kind]
+            _draw_times(axes, mine, kind, _PALETTE[index % len(_PALETTE)])
+        axes.set(title=work, xlabel="batch")
         axes.grid(alpha=0.3)
-    panels[0].set_ylabel("median time for one [µs]")
-    labels = {label: line for axes in panels for line, label in zip(*axes.get_legend_handles_labels(), strict=True)}
+    all_axes[0].set_ylabel("median time for one [µs]")
+    labels = {label: line for axes in all_axes for line, label in zip(*axes.get_legend_handles_labels(), strict=True)}
     figure.legend(labels.values(), labels.keys(), loc="outside lower center", ncols=4, frameon=False)
     _save(figure, path)
 
@@ -146,62 +153,95 @@ def _implementation(row: Mapping[str, Any]) -> str:
     return f"{row['implementation']}{', compiled' if row['compiled'] else ''}{device}"
 
 
-def _batches(rows: Sequence[Mapping[str, Any]], task: str) -> int:
-    return len({row["batch"] for row in rows if row["what"] == task})
+def _draw_times(axes: Axes, rows: Sequence[Mapping[str, Any]], kind: str, colour: str) -> None:
+    times = [row["median_us"] / row["batch"] for row in rows]
+    style = "--" if "compiled" in kind else "-"
+    axes.loglog([row["batch"] for row in rows], times, style, color=colour, marker="o", markersize=4, label=kind)
 
 
-def _success(row: ResultRow, solvable: bool) -> Rate | None:
-    value = row.success_solvable if solvable else row.success
-    return None if value is None else Rate(value, *(row.success_solvable_ci if solvable else row.success_ci))
+def _panels_of(task: Task) -> list[_Panel]:
+    """All episodes, and the solvable ones where a task knows which these are."""
+    everything = _Panel("all episodes", solvable=False)
+    return [everything] if task.truth is None else [everything, _Panel("solvable episodes", solvable=True)]
 
 
-def _draw_row(axes: "Axes", line: int, row: ResultRow, solvable: bool) -> None:
-    rate = _success(row, solvable)
-    paper = row.paper_success_solvable if solvable else row.paper_success
+def _styles(task: Task, planners: Iterable[str]) -> dict[str, Style]:
+    """The style of each planner of ``task``, and of those beside them."""
+    names = dict.fromkeys([*task.planners, *planners])
+    others = [name for name in names if name not in STYLES]
+    further = {name: FURTHER_STYLES[index % len(FURTHER_STYLES)] for index, name in enumerate(others)}
+    return {name: STYLES.get(name) or further[name] for name in names}
+
+
+def _axis(task: Task, over: str) -> str:
+    text = next(one.metadata.get("text", one.name) for one in fields(task.settings) if one.name == over)
+    return f"{text} [{unit_of(task, over)}]" if unit_of(task, over) else text
+
+
+def _set_title(figure: Figure, task: Task, row: ResultRow, settings: Iterable[str]) -> None:
+    told = [describe_setting(task, name, row.settings[name]) for name in settings]
+    title = ", ".join([f"{row.task}, {row.static} planner", *told, f"{row.episodes} episodes"])
+    figure.suptitle(textwrap.fill(title, TITLE_WIDTH))
+
+
+def _draw_row(axes: Axes, line: int, colour: str, rate: Rate | None, paper: float | None) -> None:
     if rate is not None:
-        axes.barh(line, rate.value, height=0.55, color=COLOURS.get(row.planner, _GREY), alpha=0.75)
-        reach = [[rate.value - rate.low], [rate.high - rate.value]]
-        axes.errorbar(rate.value, line, xerr=reach, color="black", capsize=3, linewidth=1.2)
-        axes.text(0.015, line, f"{100 * rate.value:.0f} %", va="center")
+        axes.barh(line, rate.value, height=0.55, color=colour, alpha=0.75)
+        ends = [[rate.value - rate.low], [rate.high - rate.value]]
+        axes.errorbar(rate.value, line, xerr=ends, color="black", capsize=3, linewidth=1.2)
+        # Within the bar where it is long enough, else beyond the interval.
+        place = 0.015 if rate.low > 0.2 else rate.high + 0.02
+        axes.text(place, line, f"{100 * rate.value:.0f} %", va="center")
     if paper is not None:
         axes.plot(paper, line, "|", color=_GREY, markersize=20, markeredgewidth=2)
 
 
-def _draw_curve(axes: "Axes", rows: Sequence[ResultRow], over: Sweep, solvable: bool) -> None:
-    known = [(row, rate) for row in rows if (rate := _success(row, solvable)) is not None]
-    planner, static = rows[0].planner, rows[0].static
-    colour = COLOURS.get(planner, _GREY)
-    x = [getattr(row, over) for row, _ in known]
-    low, high = [rate.low for _, rate in known], [rate.high for _, rate in known]
-    axes.fill_between(x, low, high, color=colour, alpha=0.15, linewidth=0)
-    axes.plot(
-        x,
-        [rate.value for _, rate in known],
-        color=colour,
-        marker=MARKERS.get(planner, "o"),
-        markersize=4,
-        label=planner,
-    )
-    paper = None if rows[0].task == "reach" else paper_curve(planner, static, over, solvable=solvable)
-    if paper is not None:
-        axes.plot(*paper, "--", color=colour, linewidth=1.0, alpha=0.8)
+def _draw_curve(axes: Axes, rows: Sequence[ResultRow], over: str, panel: _Panel, style: Style) -> None:
+    in_order = sorted(rows, key=lambda row: row.settings[over])
+    known = [(row.settings[over], rate) for row in in_order if (rate := panel.rate(row)) is not None]
+    if not known:
+        return
+    xs, rates = zip(*known, strict=True)
+    values, low, high = zip(*rates, strict=True)
+    axes.fill_between(xs, low, high, color=style.colour, alpha=0.15, linewidth=0)
+    axes.plot(xs, values, color=style.colour, marker=style.marker, markersize=4, label=rows[0].planner)
 
 
-def _panels(height: float, count: int = 2) -> tuple["Figure", list["Axes"]]:
+def _draw_paper(axes: Axes, task: Task, row: ResultRow, over: str, panel: _Panel) -> None:
+    """The paper's curves of the planners that are drawn, and of the task's rivals; ``row`` has the other settings."""
+    if task.paper is None:
+        return
+    paper, settings = task.paper(), task.settings(**row.settings)
+    drawn = [str(line.get_label()) for line in axes.get_lines()]
+    ours = False
+    for planner, style in _styles(task, ()).items():
+        curve = paper.curve(planner, row.static, over, settings, solvable=panel.solvable)
+        rival = planner in task.rivals
+        if curve is None or not (rival or planner in drawn):
+            continue
+        # A label that begins with "_" is not in the legend.
+        label = f"paper, {planner}" if rival else f"_{planner}"
+        axes.plot(*curve, "--", color=style.colour, linewidth=1.1, alpha=0.8, label=label)
+        ours = ours or not rival
+    if ours:
+        axes.plot([], [], "--", color=_GREY, label="paper")
+
+
+def _axes(height: float, count: int) -> tuple[Figure, list[Axes]]:
     """Panels side by side that share the upright axis, drawn without a display."""
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
 
     figure = Figure(figsize=(max(9.0, 3.5 * count), height), layout="constrained", dpi=150)
     FigureCanvasAgg(figure)
-    panels = [figure.add_subplot(1, count, 1)]
+    all_axes = [figure.add_subplot(1, count, 1)]
     for index in range(2, count + 1):
-        panels.append(figure.add_subplot(1, count, index, sharey=panels[0]))
-        panels[-1].tick_params(labelleft=False)
-    for axes in panels:
+        all_axes.append(figure.add_subplot(1, count, index, sharey=all_axes[0]))
+        all_axes[-1].tick_params(labelleft=False)
+    for axes in all_axes:
         axes.spines[["top", "right"]].set_visible(False)
-    return figure, panels
+    return figure, all_axes
 
 
-def _save(figure: "Figure", path: Path) -> None:
+def _save(figure: Figure, path: Path) -> None:
     write_whole(path, lambda temporary: figure.savefig(temporary, format=path.suffix.lstrip(".") or "png"))

@@ -1,9 +1,10 @@
 """From episodes to numbers: outcomes, their summary, and the files that hold them."""
 
+from __future__ import annotations
+
 import dataclasses
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
-from functools import partial
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -12,92 +13,110 @@ from torch import Tensor
 
 from torchdyn_plan.checks import check_writable_folder
 from torchdyn_plan.errors import InputError
-from torchdyn_plan.evaluation.evidence import Evidence
-from torchdyn_plan.evaluation.failures import CAUSES, SUCCESS, failure_cause, failure_shares
 from torchdyn_plan.evaluation.intervals import rate
-from torchdyn_plan.evaluation.paper import paper_rate_at
 from torchdyn_plan.files import write_json
+from torchdyn_plan.tasks.task import Settings, Task
 from torchdyn_plan.versions import library_versions, machine
 
-_FLAGS = ("trapped", "touched", "pocketed", "solvable")
-_COUNTS = ("steps", "replans")
-_CLUES = Evidence._fields
+NO_CAUSE = -1
+"""Code of an episode that did not fail, or whose task names no causes."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class EpisodeOutcomes:
     """How each of E episodes ended, in the order of their numbers; every tensor has shape ``(E,)``."""
 
-    trapped: Tensor
-    """The ball was covered and kept, bool."""
+    success: Tensor
+    """Bool."""
     steps: Tensor
-    """Control steps until it was trapped, -1 where it was not, int64."""
+    """Control steps until the success, -1 for none, int64."""
     replans: Tensor
-    """How often the planner chose a goal, int64."""
-    touched: Tensor
-    """The ball bounced off the outside of the box, bool."""
-    pocketed: Tensor
-    """The ball fell into a pocket, bool."""
+    """How often the planner planned, int64."""
     solvable: Tensor
-    """The static planner could have been at some future place of the ball in time (paper, Section IV-B), bool."""
+    """The episode can be solved at all, by the task's notion of it, bool."""
+    flags: Mapping[str, Tensor] = field(default_factory=dict)
+    """Further outcomes of the task, bool, by name."""
+    evidence: Mapping[str, Tensor] = field(default_factory=dict)
+    """What the causes follow from, by name."""
+    cause: Tensor
+    """Index into ``causes`` of what the episode failed of, int64; `NO_CAUSE` for none."""
+    causes: tuple[str, ...] = ()
+    """Names of the causes of failure."""
     seconds: float
     """Wall time of all the episodes [s]."""
-    evidence: Evidence = None  # pyright: ignore[reportAssignmentType]
-    """What decides the cause of a failure; by default that of episodes of which nothing was recorded."""
 
     def __post_init__(self) -> None:
-        if self.evidence is None:
-            object.__setattr__(self, "evidence", Evidence.none(self.episodes))
-        for name, tensor in self._tensors().items():
-            shape = tuple(tensor.shape)
-            if shape != (self.episodes,) or not self.episodes:
-                raise InputError(f"outcomes.{name} must have shape (E,) = ({self.episodes or '>= 1'},), got {shape}")
-        for name in _FLAGS:
-            if getattr(self, name).dtype != torch.bool:
-                raise InputError(f"outcomes.{name} must be bool, got {getattr(self, name).dtype}")
+        episodes = self.episodes
+        named = {"success": self.success, "steps": self.steps, "replans": self.replans, "solvable": self.solvable}
+        for name, tensor in {**named, **self.flags, **self.evidence, "cause": self.cause}.items():
+            if tuple(tensor.shape) != (episodes,) or not episodes:
+                expected = f"(E,) = ({episodes or '>= 1'},)"
+                raise InputError(f"outcomes.{name} must have shape {expected}, got {tuple(tensor.shape)}")
+        for name, tensor in {"success": self.success, "solvable": self.solvable, **self.flags}.items():
+            if tensor.dtype != torch.bool:
+                raise InputError(f"outcomes.{name} must be bool, got {tensor.dtype}")
 
     @property
     def episodes(self) -> int:
         """Number of episodes E."""
-        return self.trapped.numel()
+        return self.success.numel()
 
-    @property
-    def cause(self) -> Tensor:
-        """Code of what each episode failed of, as of `failure_cause`, ``(E,)`` int64."""
-        return failure_cause(self.trapped, self.solvable, self.touched, self.pocketed, self.evidence)
-
-    def _tensors(self) -> dict[str, Tensor]:
-        return {name: getattr(self, name) for name in (*_FLAGS, *_COUNTS)} | self.evidence._asdict()
-
-    def to_json(self) -> dict[str, Any]:
-        """Lists and numbers for a JSON file, the cause of each failure among them."""
-        names = [None if code == SUCCESS else CAUSES[code] for code in self.cause.tolist()]
-        tensors = {name: tensor.tolist() for name, tensor in self._tensors().items()}
-        return tensors | {"cause": names, "seconds": self.seconds}
+    def to_json(self, task: Task) -> dict[str, Any]:
+        """Lists and numbers for a JSON file, in the words of ``task``, the name of each failure's cause among them."""
+        counts = {"solvable": self.solvable, "steps": self.steps, "replans": self.replans}
+        tensors = {task.words.success: self.success, **self.flags, **counts, **self.evidence}
+        content: dict[str, Any] = {name: tensor.tolist() for name, tensor in tensors.items()}
+        if self.causes:
+            content["cause"] = [None if code == NO_CAUSE else self.causes[code] for code in self.cause.tolist()]
+        return content | {"seconds": self.seconds}
 
     @classmethod
-    def from_json(cls, content: Mapping[str, Any]) -> "EpisodeOutcomes":
-        """The outcomes that `to_json` wrote, or wrote before there was evidence.
+    def from_json(cls, content: Mapping[str, Any], task: Task) -> EpisodeOutcomes:
+        """The outcomes that `to_json` wrote.
+
+        A file does not tell evidence that is bool from flags: both are read as flags.
 
         Raises:
-            InputError: an entry is missing.
+            InputError: an entry is missing, or names a cause that ``task`` does not know.
         """
-        missing = sorted({*_FLAGS, *_COUNTS, "seconds"} - set(content))
+        own = {task.words.success, "steps", "replans", "solvable", "seconds"}
+        missing = sorted(own - set(content))
         if missing:
             raise InputError(f"episode outcomes lack {', '.join(missing)}")
-        flags = {name: torch.tensor(content[name], dtype=torch.bool) for name in _FLAGS}
-        counts = {name: torch.tensor(content[name], dtype=torch.int64) for name in _COUNTS}
-        clues = Evidence.none(len(flags["trapped"]))
-        if set(_CLUES) <= set(content):
-            clues = Evidence(*(torch.tensor(content[name]).to(clue.dtype) for name, clue in clues._asdict().items()))
-        return cls(**flags, **counts, seconds=float(content["seconds"]), evidence=clues)
+        tensors = {name: torch.tensor(content[name]) for name in content if name not in {"cause", "seconds"}}
+        others = {name: tensor for name, tensor in tensors.items() if name not in own}
+        return cls(
+            success=tensors[task.words.success],
+            steps=tensors["steps"],
+            replans=tensors["replans"],
+            solvable=tensors["solvable"],
+            flags={name: tensor for name, tensor in others.items() if tensor.dtype == torch.bool},
+            evidence={name: tensor for name, tensor in others.items() if tensor.dtype != torch.bool},
+            cause=_codes(content.get("cause", [None] * len(content["steps"])), task.causes),
+            causes=task.causes,
+            seconds=float(content["seconds"]),
+        )
 
     @classmethod
-    def merge(cls, parts: Sequence["EpisodeOutcomes"]) -> "EpisodeOutcomes":
+    def merge(cls, parts: Sequence[EpisodeOutcomes]) -> EpisodeOutcomes:
         """One after the other, as if they had been one run; their times add up."""
-        tensors = {name: torch.cat([getattr(part, name) for part in parts]) for name in (*_FLAGS, *_COUNTS)}
-        evidence = Evidence(*(torch.cat(clues) for clues in zip(*(part.evidence for part in parts), strict=True)))
-        return cls(**tensors, seconds=sum(part.seconds for part in parts), evidence=evidence)
+        names = ("success", "steps", "replans", "solvable", "cause")
+        first = parts[0]
+        return cls(
+            **{name: torch.cat([getattr(part, name) for part in parts]) for name in names},
+            flags={name: torch.cat([part.flags[name] for part in parts]) for name in first.flags},
+            evidence={name: torch.cat([part.evidence[name] for part in parts]) for name in first.evidence},
+            causes=first.causes,
+            seconds=sum(part.seconds for part in parts),
+        )
+
+
+def _codes(names: Sequence[str | None], causes: Sequence[str]) -> Tensor:
+    """Codes ``(E,)`` int64 of causes by name."""
+    unknown = sorted({name for name in names if name is not None} - set(causes))
+    if unknown:
+        raise InputError(f"episode outcomes name unknown causes: {', '.join(unknown)}")
+    return torch.tensor([NO_CAUSE if name is None else causes.index(name) for name in names])
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -107,73 +126,75 @@ class ResultRow:
     planner: str
     static: str
     task: str
-    velocity: float
-    """Velocity of the ball at the start [m/s]."""
-    friction: float
-    """Friction loss of the ball."""
+    settings: dict[str, Any]
+    """The task's settings by name."""
     episodes: int
     success: float
-    """Share of all episodes that end with the ball trapped."""
+    """Share of all episodes that are a success."""
     success_ci: tuple[float, float]
     solvable: float
     """Share of all episodes that are solvable."""
     success_solvable: float | None
-    """Share of the solvable episodes that end with the ball trapped; None when there are none."""
+    """Share of the solvable episodes that are a success; None when there are none."""
     success_solvable_ci: tuple[float, float]
-    steps_to_trap: float | None
-    """Mean control steps until the ball was trapped; None when it never was."""
+    steps_to_success: float | None
+    """Mean control steps until the success; None when there was none."""
     replans: float
     """Mean number of re-plans an episode."""
     failures: dict[str, float]
-    """Cause to share of all episodes."""
+    """Cause to share of all episodes; empty for a task that names none."""
     episodes_per_second: float | None
     paper_success: float | None
     """The paper's success rate over all episodes at this setting; None where it has none."""
     paper_success_solvable: float | None
     """The paper's success rate over solvable episodes at this setting; None where it has none."""
-    motion: str = "straight"
-    """How the goal of Reach moves."""
 
 
-def summarize(
-    outcomes: EpisodeOutcomes,
-    *,
-    planner: str,
-    static: str,
-    velocity: float,
-    friction: float,
-    task: str = "trapper",
-    motion: str = "straight",
-) -> ResultRow:
+def failure_shares(outcomes: EpisodeOutcomes) -> dict[str, float]:
+    """Share of all episodes that failed of each cause, by name."""
+    codes = outcomes.cause[outcomes.cause != NO_CAUSE]
+    counts = torch.bincount(codes, minlength=len(outcomes.causes))
+    return {name: count / outcomes.episodes for name, count in zip(outcomes.causes, counts.tolist(), strict=True)}
+
+
+def summarize(outcomes: EpisodeOutcomes, *, task: Task, planner: str, static: str, settings: Settings) -> ResultRow:
     """Reduce the episodes of one planner at one setting to rates, means and causes of failure."""
-    paper = partial(paper_rate_at, planner, static, velocity, friction, task=task, motion=motion)
-    trapped, solvable = outcomes.trapped, outcomes.solvable
-    everything = rate(int(trapped.sum()), outcomes.episodes)
-    possible = rate(int((trapped & solvable).sum()), int(solvable.sum()))
+    success, solvable = outcomes.success, outcomes.solvable
+    everything = rate(int(success.sum()), outcomes.episodes)
+    possible = rate(int((success & solvable).sum()), int(solvable.sum()))
+    paper = _paper_rates(task, planner, static, settings)
     return ResultRow(
         planner=planner,
         static=static,
-        task=task,
-        velocity=velocity,
-        friction=friction,
+        task=task.name,
+        settings=dataclasses.asdict(settings),
         episodes=outcomes.episodes,
         success=everything.value,
         success_ci=(everything.low, everything.high),
         solvable=solvable.double().mean().item(),
         success_solvable=possible.value if bool(solvable.any()) else None,
         success_solvable_ci=(possible.low, possible.high),
-        steps_to_trap=outcomes.steps[trapped].double().mean().item() if bool(trapped.any()) else None,
+        steps_to_success=outcomes.steps[success].double().mean().item() if bool(success.any()) else None,
         replans=outcomes.replans.double().mean().item(),
-        failures=failure_shares(outcomes.cause),
+        failures=failure_shares(outcomes),
         episodes_per_second=outcomes.episodes / outcomes.seconds if outcomes.seconds > 0 else None,
-        paper_success=paper(solvable=False),
-        paper_success_solvable=paper(solvable=True),
-        motion=motion,
+        paper_success=paper[0],
+        paper_success_solvable=paper[1],
     )
+
+
+def _paper_rates(task: Task, planner: str, static: str, settings: Settings) -> tuple[float | None, float | None]:
+    """The paper's success rates over all and over solvable episodes."""
+    if task.paper is None:
+        return None, None
+    paper = task.paper()
+    everything = paper.rate(planner, static, settings, solvable=False)
+    return everything, paper.rate(planner, static, settings, solvable=True)
 
 
 def write_results(
     folder: Path,
+    task: Task,
     config: Mapping[str, Any],
     rows: Sequence[ResultRow],
     outcomes: Mapping[str, EpisodeOutcomes] | None = None,
@@ -185,7 +206,7 @@ def write_results(
     """
     check_writable_folder(folder)
     if outcomes is not None:
-        write_json(folder / "episodes.json", {name: episodes.to_json() for name, episodes in outcomes.items()})
+        write_json(folder / "episodes.json", {name: episodes.to_json(task) for name, episodes in outcomes.items()})
     content = {
         "config": dict(config),
         "versions": library_versions(),

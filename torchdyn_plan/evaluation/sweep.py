@@ -1,128 +1,196 @@
-"""Results along a range of velocities or frictions: one file a point, so that a killed sweep continues."""
+"""Results along the values of one setting: a file for each point, so that a killed sweep continues."""
+
+from __future__ import annotations
 
 import dataclasses
 import json
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from torchdyn_plan.checks import check_writable_folder
-from torchdyn_plan.cli_arguments import DHER_READING, EvaluateArguments, SweepArguments
+from torchdyn_plan.checks import check_choice, check_number, check_writable_folder
 from torchdyn_plan.errors import InputError
-from torchdyn_plan.evaluation.paper import paper_curve, paper_reach
-from torchdyn_plan.evaluation.plots import plot_reach, plot_sweep
-from torchdyn_plan.evaluation.results import EpisodeOutcomes, ResultRow, summarize, write_results
+from torchdyn_plan.evaluation.plots import plot_sweep
+from torchdyn_plan.evaluation.results import EpisodeOutcomes, ResultRow, write_results
+from torchdyn_plan.evaluation.study import Planners, Study
 from torchdyn_plan.files import write_json
+from torchdyn_plan.planners import Delivery
+from torchdyn_plan.tasks.task import Settings, Task, load_task
 from torchdyn_plan.versions import library_versions
 
-RunPoint = Callable[[EvaluateArguments], Mapping[str, EpisodeOutcomes]]
-"""Runs all planners at one setting: the outcomes of the same episodes by planner."""
-
-_FREE = ("out", "values", "repeats", "num_envs", "threads")
-"""Arguments that may differ when a sweep continues: they add points, or do not change them."""
+_FREE = ("values", "repeats", "num_envs", "num_threads")
+"""What may differ when a sweep continues: it adds points, or does not change them."""
 
 
-def sweep(arguments: SweepArguments, run_point: RunPoint) -> list[ResultRow]:
-    """Run the points that the folder lacks, then write ``results.json`` and ``sweep.png`` from all that were asked for.
+def sweep(
+    task: Task | str,
+    planners: Planners | None = None,
+    *,
+    over: str,
+    out: str | Path,
+    values: Sequence[float] | None = None,
+    repeats: int = 10,
+    static: str | None = None,
+    episodes: int = 100,
+    seed: int = 0,
+    split: str = "test",
+    num_envs: int = 64,
+    num_threads: int = 0,
+    delivery: Delivery | None = None,
+    weights: str | Path | None = None,
+    other_scene: bool = False,
+    progress: bool = True,
+    **settings: Any,
+) -> list[ResultRow]:
+    """Evaluate planners along the values of a setting, and write ``results.json`` and ``sweep.png``.
+
+    Points that lie in the folder are not run again.
 
     Args:
-        arguments: what to run, and the folder.
-        run_point: runs one setting.
+        task: a task, or its name as `load_task` takes it.
+        planners: as of `evaluate`.
+        over: the setting that varies.
+        out: folder of the sweep.
+        values: of that setting; those of the paper's curve for None, and the task's own where there is none.
+        repeats: series of episodes for each value, with seeds upwards from ``seed``.
+        static: as of `evaluate`, like all further arguments.
+        episodes: number of episodes for each planner, value and repeat.
+        seed: the first series of episodes.
+        split: which family of series.
+        num_envs: episodes that run side by side.
+        num_threads: of the simulation, 0 for all cores.
+        delivery: how plans come into use.
+        weights: folder of the networks of named planners.
+        other_scene: let planners of another scene play, too.
+        progress: show progress bars.
+        settings: of the task, by name, but for the one that varies.
 
     Returns:
         A row for each value and planner, over the episodes of all repeats.
 
     Raises:
-        InputError: the folder holds a sweep with another configuration, or a damaged point.
+        InputError: an unknown name, a number out of range, or the folder holds a sweep with another configuration or a
+            damaged point.
+        WeightsError: weights are missing or damaged.
         OutputError: the folder cannot be written to.
     """
-    check_writable_folder(arguments.out)
-    _claim_folder(arguments)
-    _run_missing_points(arguments, run_point)
-    rows = [row for value in _values(arguments) for row in _rows_at(arguments, value)]
-    write_results(arguments.out, _config(arguments), rows)
-    if arguments.task == "reach":
-        plot_reach(rows, arguments.out / "sweep.png")
-    else:
-        plot_sweep(rows, arguments.over, arguments.out / "sweep.png")
-    return rows
+    task = load_task(task)
+    check_choice(f"setting of {task.name} to sweep over", over, sweepable(task))
+    check_number("repeats", repeats, minimum=1, integer=True)
+    check_number("seed", seed, minimum=0, integer=True)
+    base = task.default_settings(**settings)
+    study = Study.of(
+        task,
+        planners,
+        static=static,
+        weights=weights,
+        delivery=delivery,
+        other_scene=other_scene,
+        episodes=episodes,
+        split=split,
+        num_envs=num_envs,
+        num_threads=num_threads,
+        progress=progress,
+    )
+    chosen = sorted(values) if values else default_values(task, over, study.static, base)
+    if len(set(chosen)) < len(chosen):
+        raise InputError(f"values must differ, got {' '.join(map(str, chosen))}")
+    points = {value: dataclasses.replace(base, **{over: value}) for value in chosen}
+    return _Sweep(study, over, points, repeats, seed, check_writable_folder(Path(out))).run()
 
 
-def _values(arguments: SweepArguments) -> list[float]:
-    """The values asked for, or those of the paper's figure."""
-    if arguments.values:
-        return sorted(arguments.values)
-    if arguments.task == "reach":
-        return paper_reach("dynamic")[0]
-    curve = paper_curve("corner", arguments.static, arguments.over, solvable=False)
-    return [] if curve is None else curve[0]
+def sweepable(task: Task) -> list[str]:
+    """Names of the settings that a sweep can vary."""
+    return [one.name for one in dataclasses.fields(task.settings) if one.metadata.get("sweep")]
 
 
-def _config(arguments: SweepArguments) -> dict[str, Any]:
-    fields = dataclasses.asdict(arguments) | {"out": str(arguments.out), "values": _values(arguments)}
-    return {name: list(value) if isinstance(value, tuple) else value for name, value in fields.items()}
+def default_values(task: Task, over: str, static: str, settings: Settings) -> list[float]:
+    """Where the paper's figure has points, if it varied ``over`` at these settings; else the task's own values."""
+    if task.paper is not None:
+        paper = task.paper()
+        curves = (paper.curve(planner, static, over, settings, solvable=False) for planner in task.planners)
+        known = next(filter(None, curves), None)
+        if known is not None:
+            return known[0]
+    own = next(one.metadata["sweep"] for one in dataclasses.fields(task.settings) if one.name == over)
+    return [float(value) for value in own]
 
 
-def _claim_folder(arguments: SweepArguments) -> None:
-    """Write down what decides a point's outcome, or hold it against what the folder says already."""
-    path = arguments.out / "sweep.json"
-    identity = {name: value for name, value in _config(arguments).items() if name not in _FREE}
-    identity["version"] = library_versions()["torchdyn-plan"]
-    if not path.exists():
-        write_json(path, identity)
-        return
-    there = {"task": "trapper"} | DHER_READING | _read_json(path)
-    for name in (*identity, *there):
-        if there.get(name) != identity.get(name):
-            raise InputError(
-                f"folder {str(arguments.out)!r} holds a sweep with another configuration: "
-                f"{name} is {there.get(name)!r} there, {identity.get(name)!r} here"
-            )
+@dataclass(frozen=True)
+class _Sweep:
+    """Points of a study in a folder."""
 
+    study: Study
+    over: str
+    points: Mapping[float, Settings]
+    """Settings at each value."""
+    repeats: int
+    seed: int
+    out: Path
 
-def _run_missing_points(arguments: SweepArguments, run_point: RunPoint) -> None:
-    from tqdm import tqdm
+    def run(self) -> list[ResultRow]:
+        """Run the points that the folder lacks, and put together all that were asked for."""
+        self._claim_folder()
+        self._run_missing_points()
+        rows = [row for value in self.points for row in self._rows_at(value)]
+        write_results(self.out, self.study.task, self._config(), rows)
+        plot_sweep(self.study.task, rows, self.over, self.out / "sweep.png")
+        return rows
 
-    missing = [point for point in _points(arguments) if not _point_path(arguments, *point).exists()]
-    for value, repeat in tqdm(missing, desc=f"sweep over {arguments.over}", unit="point", disable=not missing):
-        outcomes = run_point(arguments.point(value, repeat))
-        content = {planner: episodes.to_json() for planner, episodes in outcomes.items()}
-        write_json(_point_path(arguments, value, repeat), content)
+    def _config(self) -> dict[str, Any]:
+        settings = dataclasses.asdict(next(iter(self.points.values())))
+        del settings[self.over]
+        own = {"over": self.over, "values": list(self.points), "repeats": self.repeats, "seed": self.seed}
+        return self.study.config() | {"settings": settings} | own
 
+    def _claim_folder(self) -> None:
+        """Write down what decides a point's outcome, or hold it against what the folder says already."""
+        path = self.out / "sweep.json"
+        identity = {name: value for name, value in self._config().items() if name not in _FREE}
+        # Each setting has a line of its own, to be named where it differs.
+        identity |= identity.pop("settings")
+        identity["version"] = library_versions()["torchdyn-plan"]
+        if not path.exists():
+            write_json(path, identity)
+            return
+        there = _read_json(path)
+        for name in (*identity, *there):
+            if there.get(name) != identity.get(name):
+                raise InputError(
+                    f"folder {str(self.out)!r} holds a sweep with another configuration: "
+                    f"{name} is {there.get(name)!r} there, {identity.get(name)!r} here"
+                )
 
-def _points(arguments: SweepArguments) -> Iterator[tuple[float, int]]:
-    """All values of a repeat before the next repeat, so that an early look at the folder shows the whole range."""
-    return ((value, repeat) for repeat in range(arguments.repeats) for value in _values(arguments))
+    def _run_missing_points(self) -> None:
+        from tqdm import tqdm
 
+        missing = [point for point in self._all_points() if not self._path(*point).exists()]
+        quiet = not (missing and self.study.progress)
+        for value, repeat in tqdm(missing, desc=f"sweep over {self.over}", unit="point", disable=quiet):
+            outcomes = self.study.run(self.points[value], self.seed + repeat)
+            content = {planner: episodes.to_json(self.study.task) for planner, episodes in outcomes.items()}
+            write_json(self._path(value, repeat), content)
 
-def _point_path(arguments: SweepArguments, value: float, repeat: int) -> Path:
-    return arguments.out / "points" / f"{arguments.over}-{float(value)!r}-repeat-{repeat:02d}.json"
+    def _all_points(self) -> Iterator[tuple[float, int]]:
+        """All values of a repeat before the next repeat, so that an early look at the folder shows the whole range."""
+        return ((value, repeat) for repeat in range(self.repeats) for value in self.points)
 
+    def _path(self, value: float, repeat: int) -> Path:
+        return self.out / "points" / f"{self.over}-{float(value)!r}-repeat-{repeat:02d}.json"
 
-def _rows_at(arguments: SweepArguments, value: float) -> list[ResultRow]:
-    """A row for each planner at ``value``, over all repeats."""
-    points = [_read_point(_point_path(arguments, value, repeat), arguments) for repeat in range(arguments.repeats)]
-    setting = arguments.point(value, 0)
-    return [
-        summarize(
-            EpisodeOutcomes.merge([point[planner] for point in points]),
-            planner=planner,
-            static=setting.static,
-            velocity=setting.velocity,
-            friction=setting.friction,
-            task=arguments.task,
-            motion=arguments.motion,
-        )
-        for planner in setting.planners
-    ]
+    def _rows_at(self, value: float) -> list[ResultRow]:
+        """A row for each planner at ``value``, over all repeats."""
+        repeats = [self._read_point(self._path(value, repeat)) for repeat in range(self.repeats)]
+        merged = {name: EpisodeOutcomes.merge([point[name] for point in repeats]) for name in self.study.planners}
+        return self.study.summarize(self.points[value], merged)
 
-
-def _read_point(path: Path, arguments: SweepArguments) -> dict[str, EpisodeOutcomes]:
-    try:
-        content = _read_json(path)
-        return {planner: EpisodeOutcomes.from_json(content[planner]) for planner in arguments.planners}
-    except (InputError, KeyError, TypeError) as error:
-        raise InputError(f"point {str(path)!r} is damaged ({error}): delete it to run it again") from error
+    def _read_point(self, path: Path) -> dict[str, EpisodeOutcomes]:
+        try:
+            content = _read_json(path)
+            return {name: EpisodeOutcomes.from_json(content[name], self.study.task) for name in self.study.planners}
+        except (InputError, KeyError, TypeError, ValueError) as error:
+            raise InputError(f"point {str(path)!r} is damaged ({error}): delete it to run it again") from error
 
 
 def _read_json(path: Path) -> Any:

@@ -31,7 +31,7 @@ class Trace(NamedTuple):
 
 
 class TraceLog:
-    """Records what environments and planner write; each environment's row starts anew with its next episode."""
+    """Records what environments and planner write; each environment's row starts afresh with its next episode."""
 
     def __init__(self, max_steps: int) -> None:
         """Room for episodes of up to ``max_steps`` control steps."""
@@ -79,7 +79,5 @@ class TraceLog:
 
 def _split(record: Tensor, length: Tensor) -> Trace:
     tool_pos, target_pos, goal, arrival, planned, reachable = record.split([3, 3, 3, 1, 1, 1], dim=-1)
-    return Trace(
-        tool_pos, target_pos, goal, arrival.squeeze(-1).long(), planned.squeeze(-1) > 0, reachable.squeeze(-1) > 0,
-        length,
-    )  # fmt: skip
+    planned, reachable = planned.squeeze(-1) > 0, reachable.squeeze(-1) > 0
+    return Trace(tool_pos, target_pos, goal, arrival.squeeze(-1).long(), planned, reachable, length)

@@ -1,28 +1,28 @@
 """Arms as batched torch: pose and Jacobian in closed form, damped least squares, and inverse kinematics by it."""
 
 from torchdyn_plan.kinematics.arm import Arm
-from torchdyn_plan.kinematics.dls import dls_step, limited_step, upright_error
+from torchdyn_plan.kinematics.dls import dls_step, limited_step, square_turn, upright_error
+from torchdyn_plan.kinematics.fused import compiled_pose_and_jacobian
 from torchdyn_plan.kinematics.joint import Joint
 from torchdyn_plan.kinematics.solver import IKResult, IKStatus, solve_ik
-from torchdyn_plan.kinematics.steps import DampedSteps, compiled_pose_and_jacobian
-from torchdyn_plan.kinematics.targets import rotation_vector, task_error, task_jacobian
+from torchdyn_plan.kinematics.targets import constraint_error, constraint_jacobian, rotation_vector
 from torchdyn_plan.kinematics.ur5 import UR5_LINKS, UR5_SPEED_LIMIT, ur5_urdf
 
 __all__ = [
     "UR5_LINKS",
     "UR5_SPEED_LIMIT",
     "Arm",
-    "DampedSteps",
     "IKResult",
     "IKStatus",
     "Joint",
     "compiled_pose_and_jacobian",
+    "constraint_error",
+    "constraint_jacobian",
     "dls_step",
     "limited_step",
     "rotation_vector",
     "solve_ik",
-    "task_error",
-    "task_jacobian",
+    "square_turn",
     "upright_error",
     "ur5_urdf",
 ]

@@ -63,6 +63,7 @@ class Arm(nn.Module):
         self.joint_names: tuple[str, ...] = tuple(joint.name for joint in moving)
         self.joint_kinds: tuple[str, ...] = tuple(joint.kind for joint in moving)
         self.num_joints = len(moving)
+        self._made_from = {"joints": (*moving, Joint(offset=tool)), "speed_limit": speed_limit, "form": form}
         limits = {
             "lower": [joint.lower for joint in moving],
             "upper": [joint.upper for joint in moving],
@@ -73,6 +74,10 @@ class Arm(nn.Module):
         self.form = FORMS[form](moving, tool)
         self.components = ComponentForm(moving, tool)
         self.to(device=device, dtype=dtype)
+
+    def part_settings(self) -> dict[str, Any]:
+        """Arguments of the constructor that make the same arm, on the CPU."""
+        return {**self._made_from, "dtype": self.lower.dtype}
 
     @classmethod
     def ur5(

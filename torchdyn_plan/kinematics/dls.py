@@ -12,10 +12,10 @@ def dls_step(jacobian: Tensor, error: Tensor, damping: float | Tensor, *, prefer
     """Joint step of damped least squares, Δq = Jᵀ(JJᵀ + λ²I)⁻¹e (Wampler 1986; Nakamura & Hanafusa 1986).
 
     Args:
-        jacobian: ``(*B, R, N)``, rows [v; ω] or the task's part of them.
+        jacobian: ``(*B, R, N)``, rows [v; ω] or the constrained ones among them.
         error: ``(*B, R)``, the twist still to go [m; rad].
         damping: λ > 0, a number or ``(*B,)``; at a singular configuration it bounds the step by ``|e| / 2λ``.
-        preferred: ``(*B, N)``, a step of which the part is added that the task leaves free (Liégeois 1977).
+        preferred: ``(*B, N)``, a step of which the part is added that the constraint leaves free (Liégeois 1977).
 
     Returns:
         ``(*B, N)`` [rad].
@@ -41,9 +41,14 @@ def upright_error(rotation: Tensor) -> Tensor:
     Returns:
         ``(*B, 3)`` [rad], base frame: tilt by the small-angle cross product z_tool × (-z), yaw exactly.
     """
-    yaw = torch.atan2(rotation[..., 1, 0], rotation[..., 0, 0])
-    turn = torch.round(yaw / QUARTER_TURN) * QUARTER_TURN - yaw
+    turn = square_turn(rotation[..., 0, 0], rotation[..., 1, 0])
     return torch.stack([-rotation[..., 1, 2], rotation[..., 0, 2], turn], dim=-1)
+
+
+def square_turn(x: Tensor, y: Tensor) -> Tensor:
+    """Turn about z [rad] to the nearest world axis of a square tool, whose x axis shows along (x, y)."""
+    yaw = torch.atan2(y, x)
+    return torch.round(yaw * (1.0 / QUARTER_TURN)) * QUARTER_TURN - yaw
 
 
 def limited_step(step: Tensor, limit: Tensor, gain: float) -> Tensor:

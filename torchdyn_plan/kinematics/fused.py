@@ -3,13 +3,16 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import torch
 from torch import Tensor
 
 from torchdyn_plan.errors import CompileError, InputError
 from torchdyn_plan.kinematics.components import Component, Vector
+
+if TYPE_CHECKING:
+    from torchdyn_plan.kinematics.arm import Arm
 
 Columns = tuple[Tensor, ...]
 
@@ -80,3 +83,20 @@ class Fused:
 def filled(value: Component, like: Tensor) -> Tensor:
     """``value`` as a column like ``like``."""
     return value if isinstance(value, Tensor) else torch.full_like(like, value)
+
+
+def compiled_pose_and_jacobian(arm: Arm) -> Callable[[Tensor], tuple[Tensor, Tensor]]:
+    """The arm's pose ``(B, 3, 4)``, without its last row, and Jacobian ``(B, 6, N)`` as one compiled loop."""
+
+    def columns(joint_pos: Columns) -> tuple[Vector, Vector]:
+        rotation, place, jacobian = arm.components(joint_pos)
+        pose = [entry for row, end in zip(rotation, place, strict=True) for entry in (*row, end)]
+        return pose, [entry for row in zip(*jacobian, strict=True) for entry in row]
+
+    fused = Fused(columns)
+
+    def pose_and_jacobian(joint_pos: Tensor) -> tuple[Tensor, Tensor]:
+        pose, jacobian = fused(joint_pos)
+        return pose.unflatten(-1, (3, 4)), jacobian.unflatten(-1, (6, arm.num_joints))
+
+    return pose_and_jacobian

@@ -7,11 +7,11 @@ from torch import Tensor
 
 from torchdyn_plan.kinematics.arm import Arm
 from torchdyn_plan.kinematics.dls import dls_step
-from torchdyn_plan.kinematics.targets import task_error, task_jacobian
+from torchdyn_plan.kinematics.targets import constraint_error, constraint_jacobian
 
 
 def refine(
-    arm: Arm, target: Tensor, solution: Tensor, solved: Tensor, *, task: str = "pose", symmetry: int = 1
+    arm: Arm, target: Tensor, solution: Tensor, solved: Tensor, *, constraint: str = "pose", symmetry: int = 1
 ) -> Tensor:
     """``solution`` once more, with derivatives in ``target`` and in the arm's own tensors.
 
@@ -30,8 +30,8 @@ def refine(
         target: ``(*B, 4, 4)``.
         solution: ``(*B, N)``, taken as a constant.
         solved: ``(*B,)`` bool, rows that are within the tolerances.
-        task: see `targets.task_error`.
-        symmetry: see `targets.task_error`.
+        constraint: see `targets.constraint_error`.
+        symmetry: see `targets.constraint_error`.
 
     Returns:
         ``(*B, N)``
@@ -44,7 +44,7 @@ def refine(
     q = constant
     for _ in range(2):
         pose, jacobian = arm.pose_and_jacobian(q)
-        error = task_error(pose, target, task=task, symmetry=symmetry)
-        rows = task_jacobian(jacobian, target, task=task) * free.unsqueeze(-2)
+        error = constraint_error(pose, target, constraint=constraint, symmetry=symmetry)
+        rows = constraint_jacobian(jacobian, target, constraint=constraint) * free.unsqueeze(-2)
         q = q + dls_step(rows, error, damping)
     return torch.where(solved.unsqueeze(-1), q, constant)

@@ -15,7 +15,7 @@ from torchdyn_plan.errors import InputError
 from torchdyn_plan.kinematics.arm import Arm
 from torchdyn_plan.kinematics.dls import dls_step
 from torchdyn_plan.kinematics.implicit import refine
-from torchdyn_plan.kinematics.targets import TASKS, task_error, task_jacobian
+from torchdyn_plan.kinematics.targets import CONSTRAINTS, constraint_error, constraint_jacobian
 
 BLOCK = 64
 """Rows of one product of matrices: a fixed number, so that a row's answer does not depend on its company."""
@@ -53,7 +53,7 @@ class _Search(NamedTuple):
     """What every row shares."""
 
     arm: Arm
-    task: str
+    constraint: str
     symmetry: int
     tolerances: tuple[float, float]
     iterations: int
@@ -66,7 +66,7 @@ def solve_ik(
     target: Tensor,
     *,
     q0: Tensor | None = None,
-    task: str = "pose",
+    constraint: str = "pose",
     symmetry: int = 1,
     position_tolerance: float = 1e-3,
     rotation_tolerance: float = math.radians(0.5),
@@ -83,44 +83,46 @@ def solve_ik(
 
     Args:
         arm: whose tool it is.
-        target: ``(*B, 4, 4)``, base frame [m]; ``(*B, 3)`` will do for the task "position".
+        target: ``(*B, 4, 4)``, base frame [m]; ``(*B, 3)`` will do for the constraint "position".
         q0: start of the first round, ``(*B, N)`` or ``(N,)``; a fixed one by default.
-        task: "pose", "axis" (place, and direction of the tool's z axis: yaw is free) or "position".
-        symmetry: for the task "pose", the tool is the same after one ``symmetry``-th of a turn about its z axis.
+        constraint: "pose", "axis" (place, and direction of the tool's z axis: yaw is free) or "position".
+        symmetry: for the constraint "pose", the tool is the same after one ``symmetry``-th of a turn about its z axis.
         position_tolerance: [m]
         rotation_tolerance: [rad]
         iterations: most steps from one start.
         rounds: number of starts, side by side, in each round; rows solved in one do not enter the next.
         max_step: most that any joint moves in one step, a number or ``(N,)`` [rad; m].
-        posture: ``(*B, N)`` or ``(N,)``, to which the motion that the task leaves free is drawn.
+        posture: ``(*B, N)`` or ``(N,)``, to which the motion that the constraint leaves free is drawn.
         differentiable: give ``q`` derivatives in ``target`` and the arm's own tensors, see `implicit.refine`.
 
     Raises:
         InputError: a shape, device, precision, name or number is wrong.
     """
-    check_choice("task", task, TASKS)
+    check_choice("constraint", constraint, CONSTRAINTS)
     check_number("symmetry", symmetry, minimum=1, integer=True)
     check_number("iterations", iterations, minimum=1, integer=True)
-    target = _as_pose(target, arm, task)
+    target = _as_pose(target, arm, constraint)
     batch, count = target.shape[:-2], arm.num_joints
     with torch.no_grad():
         wanted = target.detach().reshape(-1, 4, 4)
         posture = None if posture is None else _rows("posture", posture, arm, batch)
         limit = torch.as_tensor(max_step, dtype=wanted.dtype, device=wanted.device).expand(count)
         tolerances = position_tolerance, rotation_tolerance
-        search = _Search(arm, task, symmetry, tolerances, iterations, limit, posture)
+        search = _Search(arm, constraint, symmetry, tolerances, iterations, limit, posture)
         starts = _starts(arm, sum(rounds))
         first = starts[:1].expand(len(wanted), count) if q0 is None else _rows("q0", q0, arm, batch)
         q, status, residual = _solve_rows(search, wanted, first, starts, rounds)
     result = IKResult(q.view(*batch, count), status.view(batch), residual.view(*batch, 2))
     if not differentiable:
         return result
-    return result._replace(q=refine(arm, target, result.q, result.status == 0, task=task, symmetry=symmetry))
+    return result._replace(
+        q=refine(arm, target, result.q, result.status == 0, constraint=constraint, symmetry=symmetry)
+    )
 
 
-def _as_pose(target: Tensor, arm: Arm, task: str) -> Tensor:
+def _as_pose(target: Tensor, arm: Arm, constraint: str) -> Tensor:
     """``target`` as poses, checked."""
-    if task == "position" and isinstance(target, Tensor) and target.shape[-1:] == (3,):
+    if constraint == "position" and isinstance(target, Tensor) and target.shape[-1:] == (3,):
         place = target.unsqueeze(-1)
         eye = torch.eye(4, dtype=target.dtype, device=target.device).expand(*place.shape[:-2], 4, 4)
         return torch.cat([eye[..., :3], torch.cat([place, torch.ones_like(place[..., :1, :])], dim=-2)], dim=-1)
@@ -162,7 +164,7 @@ def _solve_rows(
     search: _Search, target: Tensor, first: Tensor, starts: Tensor, rounds: Sequence[int]
 ) -> tuple[Tensor, Tensor, Tensor]:
     """Best positions (M, N), status (M,) and residuals (M, 2) for targets (M, 4, 4)."""
-    valid = _is_pose(target, search.task) & first.isfinite().all(dim=-1)
+    valid = _is_pose(target, search.constraint) & first.isfinite().all(dim=-1)
     if search.posture is not None:
         valid &= search.posture.isfinite().all(dim=-1)
     q, residual = first.clone(), torch.full((len(target), 2), torch.inf, dtype=first.dtype, device=first.device)
@@ -198,7 +200,7 @@ def _descend(search: _Search, target: Tensor, tries: Tensor, rows: Tensor) -> tu
         index = rows[here].repeat_interleave(number)
         wanted = target[index]
         pose, jacobian = _evaluate(search.arm, q)
-        error = task_error(pose, wanted, task=search.task, symmetry=search.symmetry)
+        error = constraint_error(pose, wanted, constraint=search.constraint, symmetry=search.symmetry)
         left = torch.stack([error[:, :3].norm(dim=-1), error[:, 3:].norm(dim=-1)], dim=-1).view(-1, number, 2)
         cost, chosen = _cost(search, left).min(dim=1)
         nearer = cost < _cost(search, residual[here])
@@ -208,7 +210,7 @@ def _descend(search: _Search, target: Tensor, tries: Tensor, rows: Tensor) -> tu
         going = cost > 1.0
         if iteration == search.iterations or not bool(going.any()):
             break
-        rows_jacobian = task_jacobian(jacobian, wanted, task=search.task)
+        rows_jacobian = constraint_jacobian(jacobian, wanted, constraint=search.constraint)
         q = _stepped(search, q, rows_jacobian, error, None if search.posture is None else search.posture[index])
         here, q = here[going], q.view(-1, number, joints)[going].reshape(-1, joints)
     return best, residual
@@ -243,10 +245,10 @@ def _cost(search: _Search, residual: Tensor) -> Tensor:
     return torch.maximum(residual[..., 0] / place, residual[..., 1] / direction)
 
 
-def _is_pose(target: Tensor, task: str) -> Tensor:
-    """Whether targets ``(M, 4, 4)`` are finite, and their rotations orthonormal where the task has any."""
+def _is_pose(target: Tensor, constraint: str) -> Tensor:
+    """Whether targets ``(M, 4, 4)`` are finite, and their rotations orthonormal where the constraint has any."""
     finite = target.isfinite().all(dim=-1).all(dim=-1)
-    if task == "position":
+    if constraint == "position":
         return finite
     rotation = target[:, :3, :3]
     off = rotation.mT @ rotation - torch.eye(3, dtype=target.dtype, device=target.device)
@@ -257,7 +259,7 @@ def _is_pose(target: Tensor, task: str) -> Tensor:
 def _reason(search: _Search, q: Tensor, target: Tensor) -> Tensor:
     """Status (M,) of rows that were not solved."""
     _, jacobian = _evaluate(search.arm, q)
-    values = torch.linalg.svdvals(task_jacobian(jacobian, target, task=search.task))
+    values = torch.linalg.svdvals(constraint_jacobian(jacobian, target, constraint=search.constraint))
     at_limit = ((q <= search.arm.lower) | (q >= search.arm.upper)).any(dim=-1)
     status = torch.where(at_limit, int(IKStatus.LIMITED), int(IKStatus.UNREACHED))
     return torch.where(values[:, -1] < 0.02 * values[:, 0], int(IKStatus.SINGULAR), status)

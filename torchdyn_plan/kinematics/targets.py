@@ -7,17 +7,17 @@ import math
 import torch
 from torch import Tensor
 
-TASKS = {"pose": 6, "axis": 5, "position": 3}
-"""Number of constrained directions of each task: the whole pose, place and direction of the tool's z axis, place."""
+CONSTRAINTS = {"pose": 6, "axis": 5, "position": 3}
+"""Directions that each constrains: the whole pose, place and direction of the tool's z axis, place."""
 
 
-def task_error(pose: Tensor, target: Tensor, *, task: str = "pose", symmetry: int = 1) -> Tensor:
+def constraint_error(pose: Tensor, target: Tensor, *, constraint: str = "pose", symmetry: int = 1) -> Tensor:
     """What is left to go from ``pose`` to ``target``: its place, then its turn.
 
     Args:
         pose: ``(*B, 4, 4)``, base frame.
         target: ``(*B, 4, 4)``, base frame.
-        task: one of `TASKS`.
+        constraint: one of `CONSTRAINTS`.
         symmetry: the tool is the same after one ``symmetry``-th of a turn about its z axis: 4 for a square box.
 
     Returns:
@@ -25,21 +25,21 @@ def task_error(pose: Tensor, target: Tensor, *, task: str = "pose", symmetry: in
         the target's x and y axes that brings the tool's z axis there.
     """
     way = target[..., :3, 3] - pose[..., :3, 3]
-    if task == "position":
+    if constraint == "position":
         return way
     turned, wanted = pose[..., :3, :3], target[..., :3, :3]
-    if task == "axis":
+    if constraint == "axis":
         return torch.cat([way, _tilt(turned[..., 2], wanted)], dim=-1)
     if symmetry > 1:
         wanted = wanted @ _nearest_turn(wanted.mT @ turned, symmetry)
     return torch.cat([way, rotation_vector(wanted @ turned.mT)], dim=-1)
 
 
-def task_jacobian(jacobian: Tensor, target: Tensor, *, task: str = "pose") -> Tensor:
-    """Rows of the Jacobian ``(*B, 6, N)`` that move along `task_error`: ``(*B, R, N)``."""
-    if task == "pose":
+def constraint_jacobian(jacobian: Tensor, target: Tensor, *, constraint: str = "pose") -> Tensor:
+    """Rows of the Jacobian ``(*B, 6, N)`` that move along `constraint_error`: ``(*B, R, N)``."""
+    if constraint == "pose":
         return jacobian
-    if task == "position":
+    if constraint == "position":
         return jacobian[..., :3, :]
     return torch.cat([jacobian[..., :3, :], target[..., :3, :2].mT @ jacobian[..., 3:, :]], dim=-2)
 

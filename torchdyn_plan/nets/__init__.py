@@ -1,11 +1,32 @@
 """Networks: where the target will be, how sure that is, when the robot can be there, and a policy to take it there."""
 
-from torchdyn_plan.nets.eta import Arrival, ETAConfig, ETANetwork
+from torchdyn_plan.nets.arrival import ArrivalModel, ArrivalQuery, FunctionArrival
+from torchdyn_plan.nets.distributions import ESTIMATORS, Arrival, Spread
+from torchdyn_plan.nets.eta import ETAConfig, ETANetwork
+from torchdyn_plan.nets.forecast import DescribedForecast, Forecast, ForecastModel, FunctionForecast
 from torchdyn_plan.nets.forecaster import Forecaster, ForecasterConfig
 from torchdyn_plan.nets.policy import Actor, Critic, PolicyConfig
-from torchdyn_plan.nets.spread import Spread, SpreadConfig, SpreadNetwork
+from torchdyn_plan.nets.spread import SpreadConfig, SpreadForecaster, SpreadNetwork
 
 __all__ = [
-    "Actor", "Arrival", "Critic", "ETAConfig", "ETANetwork", "Forecaster", "ForecasterConfig", "PolicyConfig", "Spread",
-    "SpreadConfig", "SpreadNetwork",
-]  # fmt: skip
+    "ESTIMATORS",
+    "Actor",
+    "Arrival",
+    "ArrivalModel",
+    "ArrivalQuery",
+    "Critic",
+    "DescribedForecast",
+    "ETAConfig",
+    "ETANetwork",
+    "Forecast",
+    "ForecastModel",
+    "Forecaster",
+    "ForecasterConfig",
+    "FunctionArrival",
+    "FunctionForecast",
+    "PolicyConfig",
+    "Spread",
+    "SpreadConfig",
+    "SpreadForecaster",
+    "SpreadNetwork",
+]

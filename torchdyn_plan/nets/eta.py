@@ -2,43 +2,20 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import TYPE_CHECKING, Any
 
 import torch
 from torch import Tensor, nn
 
 from torchdyn_plan.checks import check_choice, check_finite, check_number, check_same_device, check_trailing_shape
 from torchdyn_plan.errors import InputError
+from torchdyn_plan.nets.arrival import ArrivalModel
+from torchdyn_plan.nets.distributions import ESTIMATORS, Arrival
 from torchdyn_plan.nets.pretrained import Pretrained
 
 if TYPE_CHECKING:
-    from torchdyn_plan.nets.folded_eta import FoldedETA
-
-
-class Arrival(NamedTuple):
-    """When, and whether, the robot arrives."""
-
-    steps: Tensor
-    """``(*B,)`` control steps from now, in the network's dtype; where ``never`` is True, if it arrived after all."""
-    never: Tensor
-    """``(*B,)`` bool: the goal is not reached within the bins; in the reading ``soft``, the probability of that."""
-
-
-class ArrivalOdds(Arrival):
-    """An `Arrival` with the whole distribution."""
-
-    bins: Tensor
-    """``(*B, bins)`` probability of arriving within each bin; what is missing to 1 is that of *never*."""
-    bin_width: int
-    """Control steps in a bin."""
-
-    def by(self, time: Tensor) -> Tensor:
-        """P(the robot is there ``time`` (*B,) control steps from now): ``(*B,)``, linear within a bin."""
-        number = torch.arange(self.bins.shape[-1], device=self.bins.device)
-        passed = (time.unsqueeze(-1) / self.bin_width - number).clamp(0.0, 1.0)
-        return (self.bins * passed).sum(-1).clamp(0.0, 1.0)
+    from torchdyn_plan.nets.inference import InferenceETA
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -67,7 +44,7 @@ class ETAConfig:
             )
 
 
-class ETANetwork(Pretrained, nn.Module):
+class ETANetwork(Pretrained, ArrivalModel):
     """Estimated time of arrival P_ETA^R (paper, Section III-B.3): robot state and goal to a distribution over time.
 
     Three hidden linear + ReLU layers and a linear one. Features of the state enter the first layer separately from
@@ -127,23 +104,23 @@ class ETANetwork(Pretrained, nn.Module):
         rows = self.third(self.second(hidden.view(-1, self.config.hidden)).relu_()).relu_()
         return self.head(rows).view(*hidden.shape[:-1], self.config.bins + 1)
 
-    def arrival(self, robot_state: Tensor, goal: Tensor, *, reading: str = "mode") -> Arrival:
+    def arrival(self, robot_state: Tensor, goal: Tensor, *, estimator: str = "mode") -> Arrival:
         """Arrival time at ``goal (*B, 3)`` from ``robot_state (*B, S)``, batches broadcasting as in `forward`.
 
         Args:
             robot_state: as in `forward`.
             goal: as in `forward`.
-            reading: ``mode``, the paper's; ``expectation``, which is finer than a bin; ``odds``, which is the same with
-                the whole distribution; or ``soft``, for gradients.
+            estimator: ``mode``, the paper's; ``expectation``, which is finer than a bin; ``distribution``, the same
+                with the probability of every bin; or ``soft``, for gradients.
         """
-        check_choice("reading", reading, READINGS)
-        return READINGS[reading](self(robot_state, goal), bin_width=self.config.bin_width)
+        check_choice("estimator", estimator, ESTIMATORS)
+        return ESTIMATORS[estimator](self(robot_state, goal), bin_width=self.config.bin_width)
 
-    def folded(self) -> FoldedETA:
-        """A copy for inference, in fewer operations; what becomes of the weights later does not reach it."""
-        from torchdyn_plan.nets.folded_eta import FoldedETA
+    def for_inference(self) -> InferenceETA:
+        """A copy of the weights as they are now, in fewer operations; it does not follow later training."""
+        from torchdyn_plan.nets.inference import InferenceETA
 
-        return FoldedETA(self)
+        return InferenceETA(self)
 
     def _goal_features(self, robot_state: Tensor, goal: Tensor) -> Tensor:
         """Goal, its offset from the tool, level and full distance: ``(*B, 8)``."""
@@ -159,68 +136,6 @@ class ETANetwork(Pretrained, nn.Module):
             check_trailing_shape(name, tensor, size)
             check_same_device(name, tensor, device, type(self).__name__)
             check_finite(name, tensor)
-
-
-def decode_mode(logits: Tensor, *, bin_width: int = 5) -> Arrival:
-    """Middle of the likeliest bin, as in the paper: bin k is ``bin_width·k + (bin_width - 1)/2``, rounded down.
-
-    Args:
-        logits: ``(*B, bins + 1)``, the last for *never arrives*.
-        bin_width: control steps in a bin.
-
-    Returns:
-        `Arrival` of ``(*B,)``; ``never`` where the last class is the likeliest, with the likeliest bin all the same.
-    """
-    bins = logits.shape[-1] - 1
-    never = logits.argmax(dim=-1) == bins
-    steps = bin_width * logits[..., :bins].argmax(dim=-1) + (bin_width - 1) // 2
-    return Arrival(steps.to(logits.dtype), never)
-
-
-def decode_expectation(logits: Tensor, *, bin_width: int = 5, moments: Tensor | None = None) -> Arrival:
-    """Mean arrival time given that the robot arrives: differentiable, and finer than a bin.
-
-    Args:
-        logits: ``(*B, bins + 1)``, the last for *never arrives*.
-        bin_width: control steps in a bin.
-        moments: `arrival_moments` of the same bins, for whoever has them at hand.
-
-    Returns:
-        `Arrival` of ``(*B,)``; ``never`` where *never* is likelier than all bins together.
-    """
-    if moments is None:
-        moments = arrival_moments(logits, bin_width)
-    arrives, weighted = (logits.softmax(dim=-1) @ moments).unbind(-1)
-    return Arrival(weighted / arrives.clamp_min(1e-12), arrives < 0.5)
-
-
-def arrival_moments(logits: Tensor, bin_width: int) -> Tensor:
-    """Matrix ``(bins + 1, 2)`` from probabilities (*B, bins + 1) to that of arriving and the sum of times.
-
-    Its last row leaves *never* out.
-    """
-    bins = logits.shape[-1] - 1
-    middle = bin_width * torch.arange(bins, device=logits.device, dtype=logits.dtype) + (bin_width - 1) / 2
-    return torch.nn.functional.pad(torch.stack([torch.ones_like(middle), middle], dim=-1), (0, 0, 0, 1))
-
-
-def decode_soft(logits: Tensor, *, bin_width: int = 5) -> Arrival:
-    """As `decode_expectation`, but ``never`` is a probability: all of it is differentiable."""
-    arrival = decode_expectation(logits, bin_width=bin_width)
-    return Arrival(arrival.steps, logits.softmax(dim=-1)[..., -1])
-
-
-def decode_odds(logits: Tensor, *, bin_width: int = 5) -> ArrivalOdds:
-    """`decode_expectation` of the same logits ``(*B, bins + 1)``, and the probability of each bin."""
-    odds = ArrivalOdds(*decode_expectation(logits, bin_width=bin_width))
-    odds.bins, odds.bin_width = logits.softmax(dim=-1)[..., :-1], bin_width
-    return odds
-
-
-READINGS: dict[str, Callable[..., Arrival]] = {
-    "mode": decode_mode, "expectation": decode_expectation, "soft": decode_soft, "odds": decode_odds,
-}  # fmt: skip
-"""How a distribution over bins becomes one arrival time."""
 
 
 def arrival_classes(arrival: Tensor, *, bins: int = 100, bin_width: int = 5) -> tuple[Tensor, Tensor]:

@@ -10,12 +10,13 @@ from torch import Tensor, nn
 
 from torchdyn_plan.checks import check_finite, check_number, check_same_device, check_trailing_shape
 from torchdyn_plan.errors import InputError
-from torchdyn_plan.nets.cushions import fold
+from torchdyn_plan.nets.forecast import DescribedForecast
 from torchdyn_plan.nets.pretrained import Pretrained
+from torchdyn_plan.nets.reflection import reflect
 from torchdyn_plan.nets.symmetry import octant, square_symmetries
 
 if TYPE_CHECKING:
-    from torchdyn_plan.nets.folded import FoldedForecaster
+    from torchdyn_plan.nets.inference import InferenceForecaster
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -59,12 +60,12 @@ class ForecasterConfig:
             raise InputError(f"square_symmetry must be a bool, got {self.square_symmetry!r}")
 
 
-class Forecaster(Pretrained, nn.Module):
+class Forecaster(Pretrained, DescribedForecast):
     """Trajectory forecasting network P_traj^O (paper, eq. 2), after the convolutional one of Nikhil & Morris (2018).
 
     Relative displacements are embedded step by step, convolved over the history, joined with the newest position and
     step, and turned by one linear head into all F positions, as departures from constant velocity. On a table with
-    cushions it forecasts the unfolded line (`torchdyn_plan.nets.cushions`) and folds it back.
+    cushions it forecasts a line that runs on through them, and reflects it (`torchdyn_plan.nets.reflection`).
     """
 
     kind = "forecaster"
@@ -80,6 +81,7 @@ class Forecaster(Pretrained, nn.Module):
         """Build the network from ``config``, or from the fields of `ForecasterConfig` given as keywords."""
         super().__init__()
         self.config = config = config or ForecasterConfig(**settings)
+        self.history = config.history
         channels, length = config.channels, config.history - 1
         self.embed = nn.Conv1d(7, channels, 1)
         self.convolve = nn.ModuleList(nn.Conv1d(channels, channels, 3, stride=2) for _ in range(config.convolutions))
@@ -120,7 +122,7 @@ class Forecaster(Pretrained, nn.Module):
         Raises:
             InputError: the history has another shape, another device than the network, or holds a NaN.
         """
-        return self._forecast(target_history, folded=self.config.half_extent is not None)[0]
+        return self._forecast(target_history, reflected=self.config.half_extent is not None)[0]
 
     def describe(self, target_history: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         """The same forecast, and what a `torchdyn_plan.nets.SpreadNetwork` judges it by.
@@ -129,21 +131,21 @@ class Forecaster(Pretrained, nn.Module):
             Positions (*B, F, 3) [m, world], the last hidden layer (*B, hidden), and whether x and y are exchanged
             in it (*B,): mirrored and turned histories share their features.
         """
-        forecast, features, swapped = self._forecast(target_history, folded=self.config.half_extent is not None)
+        forecast, features, swapped = self._forecast(target_history, reflected=self.config.half_extent is not None)
         batch = target_history.shape[:-2]
         return forecast, features.view(*batch, self.config.hidden), swapped.view(batch)
 
-    def unfolded(self, target_history: Tensor) -> Tensor:
-        """Same as `forward` before cushions mirror the line: what training compares, ``(*B, F, 3)`` [m, world]."""
-        return self._forecast(target_history, folded=False)[0]
+    def unreflected(self, target_history: Tensor) -> Tensor:
+        """Same as `forward` before cushions reflect the line: what training compares, ``(*B, F, 3)`` [m, world]."""
+        return self._forecast(target_history, reflected=False)[0]
 
-    def folded(self) -> FoldedForecaster:
-        """A copy for inference, in fewer operations; what becomes of the weights later does not reach it."""
-        from torchdyn_plan.nets.folded import FoldedForecaster
+    def for_inference(self) -> InferenceForecaster:
+        """A copy of the weights as they are now, in fewer operations; it does not follow later training."""
+        from torchdyn_plan.nets.inference import InferenceForecaster
 
-        return FoldedForecaster(self)
+        return InferenceForecaster(self)
 
-    def _forecast(self, target_history: Tensor, *, folded: bool) -> tuple[Tensor, Tensor, Tensor]:
+    def _forecast(self, target_history: Tensor, *, reflected: bool) -> tuple[Tensor, Tensor, Tensor]:
         """Positions (*B, F, 3), hidden features (R, hidden) and whether x and y are exchanged in them (R,)."""
         if not torch.compiler.is_compiling():
             self._check(target_history)
@@ -155,16 +157,16 @@ class Forecaster(Pretrained, nn.Module):
             turn = self.symmetries[octant(torch.add(now - before, now, alpha=1e-6))]
             history = torch.bmm(history, turn)
         line, hidden = self._line(history)
-        if folded:
+        if reflected:
             assert config.half_extent is not None
-            line = torch.cat([fold(line[:, :2], config.half_extent), line[:, 2:]], dim=1)
+            line = torch.cat([reflect(line[:, :2], config.half_extent), line[:, 2:]], dim=1)
         if turn is not None:
             line = torch.bmm(turn, line)
         swapped = hidden.new_zeros(len(hidden), dtype=torch.bool) if turn is None else turn[:, 0, 0] == 0.0
         return line.mT.view(*target_history.shape[:-2], config.horizon, 3), hidden, swapped
 
     def _line(self, history: Tensor) -> tuple[Tensor, Tensor]:
-        """Unfolded positions ``(R, 3, F)`` after the turned histories ``(R, H, 3)`` [m], and the last hidden layer."""
+        """Unreflected positions (R, 3, F) after the turned histories (R, H, 3) [m], and the last hidden layer."""
         now, step = history[:, -1], history[:, 1:] - history[:, :-1]
         newest = step[:, -1]
         features = self._step_features(step)
@@ -190,7 +192,7 @@ class Forecaster(Pretrained, nn.Module):
             place, speed = now[:, :2], step[:, :2]
             direction = torch.where(speed < 0, -1.0, 1.0)
             wait = (extent - place * direction).div_((speed * direction).clamp_min(1e-6)).clamp(0.0, 2.0 * horizon)
-            features += [wait, wait.log1p(), fold(torch.addcmul(place, speed, wait.flip(-1)), extent)]
+            features += [wait, wait.log1p(), reflect(torch.addcmul(place, speed, wait.flip(-1)), extent)]
         return torch.cat(features, dim=-1) * self._present_scale
 
     def _check(self, target_history: Tensor) -> None:

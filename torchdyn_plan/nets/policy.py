@@ -19,7 +19,7 @@ GOAL_FEATURES = 11
 
 @dataclass(frozen=True, kw_only=True)
 class PolicyConfig:
-    """Sizes of an `Actor` and its `Critic`; for Trapper's UR5 by default."""
+    """Sizes of an `Actor` and its `Critic`; for a UR5 by default."""
 
     robot_state_size: int = 15
     """Size S of the robot state."""

@@ -51,12 +51,12 @@ class Pretrained:
 
     @classmethod
     def from_pretrained(cls, name_or_path: str | Path, *, device: torch.device | str | None = None) -> Self:
-        """Network of this class from a name that ships with the package, a file, or a folder of `save_pretrained`.
+        """Network of this class from a name that ships, a file, or a folder of `save_pretrained` or of a training.
 
         Raises:
             WeightsError: no such name or file; or a file that is truncated or holds another network.
         """
-        file = cls._find(name_or_path)
+        file = cls.find(name_or_path)
         metadata, tensors = _read(file)
         if metadata.get("format") != FORMAT or metadata.get("class") != cls.__name__:
             found = metadata.get("class") or "no network of this package"
@@ -71,9 +71,11 @@ class Pretrained:
         return network.to(device).eval()
 
     @classmethod
-    def _find(cls, name_or_path: str | Path) -> Path:
+    def find(cls, name_or_path: str | Path) -> Path:
+        """File of the network of that name, or in that file or folder; raises `WeightsError` if there is none."""
         path = Path(name_or_path)
-        choices = (path, path / f"{cls.kind}.safetensors", SHIPPED / f"{cls.kind}-{name_or_path}.safetensors")
+        file = f"{cls.kind}.safetensors"
+        choices = (path, path / file, path / cls.kind / file, SHIPPED / f"{cls.kind}-{name_or_path}.safetensors")
         for choice in choices:
             if choice.is_file():
                 return choice

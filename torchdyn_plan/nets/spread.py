@@ -1,56 +1,17 @@
 """How far a forecast may be off: the distribution of its error at each future step, from what the forecaster saw."""
 
 from dataclasses import dataclass
-from typing import Any, NamedTuple
+from typing import Any
 
 import torch
 from torch import Tensor, nn
 
 from torchdyn_plan.checks import check_number, check_same_device, check_trailing_shape
 from torchdyn_plan.errors import InputError
+from torchdyn_plan.nets.distributions import Spread
+from torchdyn_plan.nets.forecast import DescribedForecast, Forecast, ForecastModel
+from torchdyn_plan.nets.forecaster import Forecaster
 from torchdyn_plan.nets.pretrained import Pretrained
-
-
-class Spread(NamedTuple):
-    """Distribution of a forecast's error, along x and y on its own and symmetric about the forecast.
-
-    The size of the error is log-logistic, P(|e| ≤ r) = 1 / (1 + (scale/r)^shape): half of all errors are smaller than
-    ``scale``, and the tail is as heavy as r^-shape, for a forecast is either right or has missed a bounce.
-    """
-
-    scale: Tensor
-    """``(*B, F, 2)`` median of the error's size along x and y at 1 … F steps [m]."""
-    shape: Tensor
-    """``(*B, F, 2)`` how sharply it is known, positive."""
-    gone: Tensor
-    """``(*B, F)`` probability that the target has been swallowed by then."""
-
-    def at(self, steps: Tensor) -> "Spread":
-        """The spread ``steps`` (K,) control steps ahead, 1 to F each: ``(*B, K, 2)``, ``gone`` ``(*B, K)``."""
-        index = (steps - 1).clamp_min(0)
-        return Spread(self.scale[..., index, :], self.shape[..., index, :], self.gone[..., index])
-
-    def after(self, steps: int) -> "Spread":
-        """The spread from ``steps`` control steps ahead on: that of the forecast without its first entries."""
-        return Spread(self.scale[..., steps:, :], self.shape[..., steps:, :], self.gone[..., steps:])
-
-    def within(self, size: Tensor | float) -> Tensor:
-        """P(|e| ≤ size), ``(*B, F, 2)``, of sizes that broadcast against it [m]; 0 for sizes that are not positive."""
-        size = torch.as_tensor(size, dtype=self.scale.dtype, device=self.scale.device)
-        # A guard on both sides of the `where` keeps the gradient finite.
-        exponent = self.shape * (size.clamp_min(1e-12).log() - self.scale.log())
-        return torch.where(size > 0.0, exponent.sigmoid(), 0.0)
-
-    def between(self, offset: Tensor, half_width: Tensor | float) -> Tensor:
-        """P(|offset + e| ≤ half_width) along each axis, for a place that is ``offset`` from the forecast [m]."""
-        offset = offset.abs()
-        near, far = self.within(half_width + offset), self.within((half_width - offset).abs())
-        return 0.5 * (near + torch.where(offset <= half_width, far, -far))
-
-    def interval(self, share: float) -> Tensor:
-        """Half-width ``(*B, F, 2)`` of the interval about the forecast that holds the target with P = ``share`` [m]."""
-        check_number("share", share, minimum=1e-6, maximum=1.0 - 1e-6)
-        return self.scale * (share / (1.0 - share)) ** (1.0 / self.shape)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -126,3 +87,29 @@ class SpreadNetwork(Pretrained, nn.Module):
         if swapped.shape != features.shape[:-1] or swapped.dtype != torch.bool:
             expected = f"bool of shape {tuple(features.shape[:-1])}"
             raise InputError(f"swapped must be {expected}, got {swapped.dtype} of shape {tuple(swapped.shape)}")
+
+
+class SpreadForecaster(ForecastModel):
+    """A forecaster that also says how far it may be off."""
+
+    def __init__(self, forecaster: DescribedForecast, spread: SpreadNetwork) -> None:
+        """Judge the paths of ``forecaster`` by ``spread``, which was fitted to its errors."""
+        super().__init__()
+        self.forecaster, self.spread, self.history = forecaster, spread, forecaster.history
+
+    def predict(self, *seen: Tensor) -> Forecast:
+        """Path and spread."""
+        path, features, swapped = self.forecaster.describe(*seen)
+        return Forecast(path, self.spread(features, swapped))
+
+    def for_inference(self) -> ForecastModel:
+        """A copy of the weights as they are now, in fewer operations; it does not follow later training."""
+        from torchdyn_plan.nets.inference import InferenceForecaster
+
+        if not isinstance(self.forecaster, Forecaster):
+            return self
+        return InferenceForecaster(self.forecaster, self.spread)
+
+    def part_settings(self) -> dict[str, Any]:
+        """Arguments that make the same model."""
+        return {"forecaster": self.forecaster, "spread": self.spread}

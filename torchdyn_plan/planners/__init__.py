@@ -1,44 +1,71 @@
 """Planners: for a static goal, for a moving target, and the baselines; each takes and returns a tensordict."""
 
-from torchdyn_plan.planners.adaptation import Adaptation
 from torchdyn_plan.planners.background import Background, measured_latency
-from torchdyn_plan.planners.baselines import OracleTrajectory, TargetPursuit, WaitAtEnd
-from torchdyn_plan.planners.callable import CallablePlanner
-from torchdyn_plan.planners.drop import Drop
-from torchdyn_plan.planners.dynamic import STATIC_PLANNERS, DynamicPlanner
-from torchdyn_plan.planners.exact import ExactSearch
-from torchdyn_plan.planners.ik import IKPlanner
-from torchdyn_plan.planners.meeting import MeetingPlanner
-from torchdyn_plan.planners.policy import PolicyPlanner
+from torchdyn_plan.planners.baselines import (
+    EndOfForecast,
+    RecordedFuture,
+    TargetPursuit,
+    oracle_trajectory,
+    wait_at_end,
+)
+from torchdyn_plan.planners.delivery import Delayed, Delivery
+from torchdyn_plan.planners.maneuver import GoTo, Maneuver
+from torchdyn_plan.planners.observation import Observation
+from torchdyn_plan.planners.plan import Lost, LostBelow, Plan, PlanStatus
+from torchdyn_plan.planners.planner import DynamicPlanner, observe
 from torchdyn_plan.planners.protocol import StaticPlanner
 from torchdyn_plan.planners.schedule import EventSchedule, ReplanSchedule, Schedule
-from torchdyn_plan.planners.search import CornerSearch, SearchResult, search_corners
-from torchdyn_plan.planners.soft import SoftCornerSearch, SoftExactSearch
-from torchdyn_plan.planners.status import PlanStatus
+from torchdyn_plan.planners.search import (
+    CornerSearch,
+    ExactSearch,
+    GoalSearch,
+    Meeting,
+    SearchContext,
+    SoftCornerSearch,
+    SoftExactSearch,
+    search_corners,
+)
+from torchdyn_plan.planners.static.approach import Approach, StraightToGoal
+from torchdyn_plan.planners.static.callable import CallablePlanner
+from torchdyn_plan.planners.static.ik import IKPlanner
+from torchdyn_plan.planners.static.policy import PolicyPlanner
+from torchdyn_plan.planners.static.proportional import ProportionalController
 
 __all__ = [
-    "STATIC_PLANNERS",
-    "Adaptation",
+    "Approach",
     "Background",
     "CallablePlanner",
     "CornerSearch",
-    "Drop",
+    "Delayed",
+    "Delivery",
     "DynamicPlanner",
+    "EndOfForecast",
     "EventSchedule",
     "ExactSearch",
+    "GoTo",
+    "GoalSearch",
     "IKPlanner",
-    "MeetingPlanner",
-    "OracleTrajectory",
+    "Lost",
+    "LostBelow",
+    "Maneuver",
+    "Meeting",
+    "Observation",
+    "Plan",
     "PlanStatus",
     "PolicyPlanner",
+    "ProportionalController",
+    "RecordedFuture",
     "ReplanSchedule",
     "Schedule",
-    "SearchResult",
+    "SearchContext",
     "SoftCornerSearch",
     "SoftExactSearch",
     "StaticPlanner",
+    "StraightToGoal",
     "TargetPursuit",
-    "WaitAtEnd",
     "measured_latency",
+    "observe",
+    "oracle_trajectory",
     "search_corners",
+    "wait_at_end",
 ]

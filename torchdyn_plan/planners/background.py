@@ -4,30 +4,33 @@ from __future__ import annotations
 
 import math
 import time
-from collections.abc import Callable, Iterable
+from collections.abc import Callable
 from concurrent.futures import Executor, Future, ThreadPoolExecutor
-from typing import NamedTuple
+from typing import ClassVar, NamedTuple
 
 import torch
-from tensordict import TensorDictBase
 from torch import Tensor
 
 from torchdyn_plan.checks import check_number
-from torchdyn_plan.planners.latency import Job, Values, where_rows
+from torchdyn_plan.planners.delivery import MakePlans
+from torchdyn_plan.planners.maneuver import NoState
+from torchdyn_plan.planners.observation import Observation
+from torchdyn_plan.planners.plan import Plan
+from torchdyn_plan.planners.rows import where_rows
 
 
 class Order(NamedTuple):
-    """A job that was handed to the thread."""
+    """Plans that the thread was asked for."""
 
-    made: Future[Values]
+    made: Future[Plan]
     rows: Tensor
-    """``(*B,)`` bool: rows that wait for it."""
+    """``(*B,)`` bool: rows that wait for them."""
     step_count: Tensor
-    """``(*B,)`` of the step in which it was ordered."""
+    """``(*B,)`` of the step in which they were ordered."""
 
 
 class Background:
-    """Makes plans in a thread while the control loop goes on; hand it to `DynamicPlanner.set_latency`.
+    """Makes plans in a thread while the control loop goes on: a planner's ``delivery``.
 
     A plan comes into use ``latency`` control steps after it was ordered, the moment for which it was made. One that is
     not ready then comes into use when it is, as old as it is; one that is not ready by the ``deadline`` never does, and
@@ -35,17 +38,19 @@ class Background:
     one loop only.
     """
 
+    State: ClassVar[type[NoState]] = NoState
+
     def __init__(self, *, latency: int, deadline: int, executor: Executor | None = None) -> None:
         """Join a thread to a loop.
 
         Args:
-            latency: control steps, as the planner was told.
+            latency: control steps from seeing to acting on it, as `measured_latency` finds them.
             deadline: control steps, at least ``latency``.
             executor: runs the jobs one after the other; a thread of its own by default.
         """
         check_number("latency", latency, minimum=0, integer=True)
         check_number("deadline", deadline, minimum=latency, integer=True)
-        self.latency, self.deadline = latency, deadline
+        self.delay, self.deadline = latency, deadline
         self.executor = executor or ThreadPoolExecutor(1, thread_name_prefix="planner")
         self.used, self.missed = 0, 0
         self._order: Order | None = None
@@ -54,49 +59,50 @@ class Background:
         """Wait for the thread's last plan and end it."""
         self.executor.shutdown()
 
-    def keys(self, values: Iterable[str]) -> tuple[str, ...]:
-        """Nothing is kept under ``plan``."""
-        return ()
+    def start(self, plan: Plan) -> NoState:
+        """Nothing."""
+        return NoState()
 
-    def arrive(self, plan: TensorDictBase | None, values: Values, step_count: Tensor) -> tuple[Values, Tensor]:
+    def older(self, state: NoState) -> NoState:
+        """Nothing."""
+        return state
+
+    def arrive(self, plan: Plan, state: NoState, observation: Observation) -> tuple[Plan, Tensor]:
         """Plans that are ready and meant for now or earlier; raises what the planning raised.
 
         Everywhere is busy while the thread is.
         """
-        busy, order = torch.zeros_like(step_count, dtype=torch.bool), self._order
+        step_count, order = observation.step_count, self._order
+        busy = torch.zeros_like(step_count, dtype=torch.bool)
         if order is None:
-            return values, busy
+            return plan, busy
         rows, age = order.rows & (step_count > 0), step_count - order.step_count
         self._order = order._replace(rows=rows)
-        if not order.made.done() or (rows & (age < self.latency)).any():
-            return values, ~busy
+        if not order.made.done() or (rows & (age < self.delay)).any():
+            return plan, ~busy
         made, self._order = order.made.result(), None
         now = rows & (age <= self.deadline)
         self.used, self.missed = self.used + int(now.any()), self.missed + int((rows & ~now).any())
-        late = (age - self.latency).clamp_min(0)
-        return {name: where_rows(now, _older(name, made[name], late), old) for name, old in values.items()}, busy
+        late = (age - self.delay).clamp_min(0)
+        made = made._replace(arrival_steps=(made.arrival_steps - late).clamp_min(0), age=made.age + late)
+        return Plan(*(where_rows(now, new, old) for new, old in zip(made, plan, strict=True))), busy
 
-    def order(self, job: Job, plan: TensorDictBase | None, values: Values) -> tuple[Values, Values]:
-        """Hand the job to the thread if any row is due."""
-        if job.due.any():
+    def order(
+        self, make: MakePlans, due: Tensor, observation: Observation, plan: Plan, state: NoState
+    ) -> tuple[Plan, NoState]:
+        """Hand the work to the thread if any row is due."""
+        if due.any():
             # The loop's world may write into the same memory while the thread reads.
-            copy = job._replace(inputs=tuple(value.clone() for value in job.inputs))
-            made = self.executor.submit(_make, copy, values, torch.is_grad_enabled())
-            self._order = Order(made, job.due, job.step_count.clone())
-        return values, {}
+            copy = Observation.of([value.clone() for value in observation.flat()])
+            made = self.executor.submit(_make, make, due, copy, plan, torch.is_grad_enabled())
+            self._order = Order(made, due, copy.step_count)
+        return plan, state
 
 
-def _make(job: Job, values: Values, gradients: bool) -> Values:
+def _make(make: MakePlans, due: Tensor, observation: Observation, plan: Plan, gradients: bool) -> Plan:
     """The plans; whether gradients are wanted is known to each thread alone."""
     with torch.set_grad_enabled(gradients):
-        return job(values)
-
-
-def _older(name: str, value: Tensor, steps: Tensor) -> Tensor:
-    """Value ``name`` of a plan that comes into use ``steps`` (*B,) after the moment for which it was made."""
-    if name == "arrival_steps":
-        return (value - steps).clamp_min(0)
-    return value + steps if name == "outlook_age" else value
+        return make(due, observation, plan, plan)
 
 
 def measured_latency(plan: Callable[[], object], control_step: float, *, runs: int = 20, quantile: float = 0.95) -> int:

@@ -1,35 +1,34 @@
-"""What the dynamic planner is measured against."""
+"""What a planner for a moving target is measured against: two extremes, and one that knows the future."""
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from typing import TYPE_CHECKING
+from dataclasses import dataclass
+from typing import Any
 
 import torch
 from tensordict import TensorDictBase
-from tensordict.nn import TensorDictModuleBase
-from torch import Tensor, nn
+from torch import Tensor
 
 from torchdyn_plan import keys
 from torchdyn_plan.checks import check_finite, check_number, check_trailing_shape
-from torchdyn_plan.planners.dynamic import DynamicPlanner
-from torchdyn_plan.planners.protocol import ArrivalPredictor, GoalSearch, StaticPlanner, keys_read, keys_written, read
-from torchdyn_plan.planners.schedule import Schedule
-from torchdyn_plan.planners.search import SearchResult
+from torchdyn_plan.nets.arrival import ArrivalQuery
+from torchdyn_plan.nets.forecast import Forecast, ForecastModel
+from torchdyn_plan.planners.memory import Remembering
+from torchdyn_plan.planners.planner import DynamicPlanner
+from torchdyn_plan.planners.protocol import StaticPlanner, keys_read, keys_written, read
+from torchdyn_plan.planners.search.meeting import NO_CONTEXT, Meeting, SearchContext
+from torchdyn_plan.planners.static.callable import TensorDictFunction
 
-if TYPE_CHECKING:
-    from torchdyn_plan.nets.eta import Arrival
 
-
-class TargetPursuit(TensorDictModuleBase):
+class TargetPursuit(Remembering):
     """Chases the target: at every step the goal is where the target is now (paper, Section IV-A.1)."""
 
-    def __init__(self, static: StaticPlanner) -> None:
-        """Chase with ``static``, a planner for a static goal."""
+    def __init__(self, static: StaticPlanner, *, scene: str | None = None) -> None:
+        """Chase with ``static``, a planner for a static goal; ``scene`` is the digest of its scene, if it has one."""
         super().__init__()
-        self.static = static
-        self.in_keys = keys_read(static, keys.TARGET_POS)
-        self.out_keys = keys_written(static, keys.GOAL, keys.ARRIVAL_STEPS)
+        self.static, self.scene = TensorDictFunction.wrap(static), scene
+        self.in_keys = keys_read(self.static, keys.TARGET_POS)
+        self.out_keys = keys_written(self.static, keys.GOAL, keys.ARRIVAL_STEPS)
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         """Write ``goal`` (*B, 3) [m, world] and ``arrival_steps`` (*B,), which is 0, and act."""
@@ -40,38 +39,26 @@ class TargetPursuit(TensorDictModuleBase):
         tensordict.set(keys.ARRIVAL_STEPS, now)
         return self.static(tensordict)
 
+    def empty_memory(self, like: Tensor) -> dict[str, Tensor]:
+        """The static planner's, as `Remembering` says."""
+        return self.static.empty_memory(like) if isinstance(self.static, Remembering) else {}
 
+
+@dataclass(frozen=True)
 class EndOfForecast:
-    """Search that always chooses the last position of the forecast."""
+    """Search that always chooses the last position of the forecast: to go there and wait (paper, III-B.4)."""
 
-    def __call__(self, forecast: Tensor, target_pos: Tensor, eta: Callable[..., Arrival]) -> SearchResult:
-        """The end of forecast (*B, F, 3), in F steps; ``eta`` is asked once, whether the robot is ever there."""
-        goal = forecast[..., -1, :]
+    def __call__(
+        self, forecast: Forecast, target_pos: Tensor, eta: ArrivalQuery, context: SearchContext = NO_CONTEXT
+    ) -> Meeting:
+        """The end of the forecast, in F steps; ``eta`` is asked once, whether the robot is ever there."""
+        goal = forecast.path[..., -1, :]
         never = eta(goal.unsqueeze(-2)).never.squeeze(-1)
-        steps = torch.full_like(never, forecast.shape[-2], dtype=torch.int64)
-        return SearchResult(goal, steps, torch.zeros_like(never), ~never)
+        steps = torch.full_like(never, forecast.path.shape[-2], dtype=torch.int64)
+        return Meeting(goal, steps, torch.zeros_like(never), ~never)
 
 
-class WaitAtEnd(DynamicPlanner):
-    """Goes to where the forecast ends and waits there: the other extreme beside pursuit (paper, III-B.4)."""
-
-    def __init__(
-        self,
-        static: StaticPlanner,
-        forecaster: Callable[..., Tensor],
-        eta: ArrivalPredictor,
-        *,
-        search: GoalSearch | None = None,
-        schedule: Schedule | None = None,
-        latency: int = 0,
-        chunk: int | None = None,
-    ) -> None:
-        """Join the parts as `DynamicPlanner` does; ``search`` is `EndOfForecast` by default."""
-        search = search or EndOfForecast()
-        super().__init__(static, forecaster, eta, search=search, schedule=schedule, latency=latency, chunk=chunk)
-
-
-class RecordedFuture(nn.Module):
+class RecordedFuture(ForecastModel):
     """Stands in for a forecaster and tells the truth, cut from a recording of the same episode.
 
     Entry k of ``target_future`` is where the target was at step k of the episode, with the arm held still.
@@ -85,40 +72,29 @@ class RecordedFuture(nn.Module):
         check_number("horizon", horizon, minimum=1, integer=True)
         self.horizon = horizon
 
-    def forward(self, target_future: Tensor, step_count: Tensor) -> Tensor:
+    def predict(self, *seen: Tensor) -> Forecast:
         """Positions at steps t+1 … t+F, ``(R, F, 3)``, of recordings ``(R, T, 3)`` [m, world] at steps t, R values."""
+        target_future, step_count = seen
         check_trailing_shape(keys.TARGET_FUTURE, target_future, target_future.shape[-2], 3)
         check_finite(keys.TARGET_FUTURE, target_future)
         ahead = torch.arange(1, self.horizon + 1, device=target_future.device)
         index = (step_count.reshape(-1, 1) + ahead).clamp(max=target_future.shape[-2] - 1)
-        return target_future.gather(-2, index.unsqueeze(-1).expand(-1, -1, 3))
+        return Forecast(target_future.gather(-2, index.unsqueeze(-1).expand(-1, -1, 3)))
+
+    def part_settings(self) -> dict[str, Any]:
+        """Arguments that make the same model."""
+        return {"horizon": self.horizon}
 
 
-class OracleTrajectory(DynamicPlanner):
-    """The dynamic planner with the recorded truth, ``target_future`` (*B, T, 3), as its forecast (paper, IV-A.2)."""
+def oracle_trajectory(static: StaticPlanner, eta: Any, *, horizon: int = 300, **parts: Any) -> DynamicPlanner:
+    """The dynamic planner with the recorded truth, ``target_future`` (*B, T, 3), as its forecast (paper, IV-A.2).
 
-    def __init__(
-        self,
-        static: StaticPlanner,
-        eta: ArrivalPredictor,
-        *,
-        search: GoalSearch | None = None,
-        schedule: Schedule | None = None,
-        latency: int = 0,
-        horizon: int = 300,
-        chunk: int | None = None,
-    ) -> None:
-        """Join the parts as `DynamicPlanner` does; ``horizon`` [control steps] is as far as the search may look."""
-        truth = RecordedFuture(horizon)
-        super().__init__(static, truth, eta, search=search, schedule=schedule, latency=latency, chunk=chunk)
+    ``horizon`` [control steps] is as far as its search may look; ``parts`` are those of `DynamicPlanner`.
+    """
+    return DynamicPlanner(static, RecordedFuture(horizon), eta, **parts)
 
-    @classmethod
-    def from_pretrained(cls, name: str, *, latency: int = 0, chunk: int | None = None) -> OracleTrajectory:
-        """The planner of that name with the recorded truth in place of its forecaster; raises what that one raises."""
-        planner = DynamicPlanner.from_pretrained(name, chunk=chunk)
-        horizon = getattr(getattr(planner.forecaster, "config", None), "horizon", 300)
-        oracle = cls(
-            planner.static, planner.eta, schedule=planner.schedule, horizon=horizon, latency=latency, chunk=chunk
-        )
-        oracle.gone_below = planner.gone_below
-        return oracle.eval().requires_grad_(False)
+
+def wait_at_end(static: StaticPlanner, forecaster: Any, eta: Any, **parts: Any) -> DynamicPlanner:
+    """Goes to where the forecast ends and waits there: the other extreme beside pursuit (paper, III-B.4)."""
+    parts.setdefault("search", EndOfForecast())
+    return DynamicPlanner(static, forecaster, eta, **parts)

@@ -1,81 +1,151 @@
-"""What the dynamic planner remembers between steps, in the tensordict under ``plan``."""
+"""What planners remember between steps: in the tensordict under ``plan``, stored, recalled and reset here alone."""
 
 from __future__ import annotations
 
-from typing import NamedTuple
+import warnings
+from collections.abc import Callable, Mapping, Sequence
+from functools import partial
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import torch
-from tensordict import NestedKey, TensorDict, TensorDictBase
+from tensordict import TensorDict, TensorDictBase
+from tensordict.nn import TensorDictModuleBase
 from torch import Tensor
 
 from torchdyn_plan import keys
-from torchdyn_plan.planners.schedule import Clock
-from torchdyn_plan.planners.search import SearchResult
+from torchdyn_plan.errors import InputError
+from torchdyn_plan.planners.maneuver import Maneuver, NoState
+from torchdyn_plan.planners.plan import Plan
+from torchdyn_plan.planners.rows import where_rows
+from torchdyn_plan.planners.schedule import Clock, Schedule
 
-MEMORY_NAMES = (*Clock._fields, *SearchResult._fields, "replanned", "status")
-USABLE = "usable"
-"""Whether the forecast, from which the plan in use was made, was of any use."""
-MEMORY_KEYS: tuple[NestedKey, ...] = tuple((keys.PLAN, name) for name in (*MEMORY_NAMES, USABLE))
-
-
-class Memory(NamedTuple):
-    """What was planned up to the step before."""
-
-    clock: Clock
-    meeting: SearchResult
+if TYPE_CHECKING:
+    from torchdyn_plan.planners.delivery import Delivery
+    from torchdyn_plan.planners.observation import Observation
 
 
-def recall(tensordict: TensorDictBase) -> Memory | None:
-    """Memory in ``tensordict``; None if it holds none yet."""
-    plan = tensordict.get(keys.PLAN, None)
-    if plan is None or plan.get(MEMORY_NAMES[0], None) is None:
-        return None
-    return Memory(Clock(*map(plan.get, Clock._fields)), SearchResult(*map(plan.get, SearchResult._fields)))
+class Slot(NamedTuple):
+    """Where the state of one part lies in the memory, and how it begins and ages."""
+
+    kind: type[Any]
+    """Its `NamedTuple` of tensors ``(*B, …)``."""
+    names: tuple[str, ...]
+    """Its entries below ``plan``, a field each."""
+    start: Callable[[Observation], Any]
+    """The state of rows at their first step."""
+    older: Callable[[Any], Any] | None
+    """The state one control step later; None for one that does not age."""
 
 
-def remember(
-    tensordict: TensorDictBase,
-    clock: Clock,
-    meeting: SearchResult,
-    *,
-    replanned: Tensor,
-    status: Tensor,
-    **others: Tensor,
-) -> None:
-    """Write the memory, and ``goal`` and ``arrival_steps`` for everybody to read, into ``tensordict``."""
-    plan = tensordict.get(keys.PLAN, None)
-    entries = {} if plan is None else dict(plan.items())
-    entries.update(zip(MEMORY_NAMES, (*clock, *meeting, replanned, status), strict=True))
-    entries.update(others)
-    # A new one each step: tensordicts of earlier steps may share the old one.
-    tensordict.set(keys.PLAN, TensorDict(entries, tensordict.batch_size, device=tensordict.device))
-    tensordict.set(keys.GOAL, meeting.goal)
-    tensordict.set(keys.ARRIVAL_STEPS, meeting.arrival_steps)
+REPORTED = ("replanned", "status")
+"""Written beside the memory, for people to read: whether a row planned at this step, and its `PlanStatus`."""
+SPARE_STEPS = 8
+"""A path is remembered for so many control steps at least, in case the next plan is late."""
 
 
-def hold(tool_pos: Tensor, step_count: Tensor) -> SearchResult:
-    """Meeting of rows without a plan: the goal is where the tool is, ``(*B, 3)`` [m, world], now."""
-    no = torch.zeros_like(step_count, dtype=torch.bool)
-    return SearchResult(tool_pos, torch.zeros_like(step_count), no, ~no)
+class PlannerMemory:
+    """The memory of a composed planner: its clock, its plan in use, its maneuver's state, and plans under way."""
+
+    def __init__(self, schedule: Schedule, maneuver: Maneuver, delivery: Delivery | None) -> None:
+        """Lay the memory out for these parts; raises `InputError` where two of them use one name."""
+        delay = 0 if delivery is None else delivery.delay
+        lookahead = max(maneuver.lookahead, int(schedule.watches))
+        self.path_length = lookahead + max(SPARE_STEPS, schedule.longest) + 2 * delay if lookahead else 0
+        hold = partial(Plan.hold, length=self.path_length)
+        self.slots = [
+            Slot(Clock, Clock._fields, schedule.start, Clock.older),
+            Slot(Plan, Plan._fields, hold, Plan.older),
+            Slot(maneuver.State, maneuver.State._fields, maneuver.start, None),
+        ]
+        if delivery is None:
+            self.slots.append(Slot(NoState, (), lambda _: NoState(), None))
+        else:
+            names = tuple(f"pending_{field}" for field in delivery.State._fields)
+            self.slots.append(Slot(delivery.State, names, lambda seen: delivery.start(hold(seen)), delivery.older))
+        self.names = [name for slot in self.slots for name in slot.names]
+        written = [*self.names, *REPORTED]
+        repeated = sorted({name for name in written if written.count(name) > 1})
+        if repeated:
+            raise InputError(f"two parts of a planner remember {', '.join(repeated)}: rename a field of a State")
+
+    def recall(self, tensordict: TensorDictBase, observation: Observation) -> list[Any]:
+        """The parts' states as they were after the step before, one step older; rows at step 0 start afresh.
+
+        The states are in the order of `slots`. Where a tensordict holds none, everything starts afresh, with a warning
+        if rows are past step 0.
+        """
+        plan = tensordict.get(keys.PLAN, None)
+        # A plain dictionary: a look-up in a tensordict takes as long as a small operation.
+        stored = {} if plan is None else dict(plan.items())
+        fresh = observation.step_count == 0
+        some_fresh = torch.compiler.is_compiling() or bool(fresh.any())
+        lost = [name for name in self.names if name not in stored]
+        if lost:
+            warn_of_loss(lost[0], fresh)
+        states = []
+        for slot in self.slots:
+            if not stored.keys() >= set(slot.names):
+                states.append(slot.start(observation))
+                continue
+            state = slot.kind(*(stored[name] for name in slot.names))
+            if slot.older is not None:
+                state = slot.older(state)
+            if some_fresh:
+                pairs = zip(slot.start(observation), state, strict=True)
+                state = slot.kind(*(where_rows(fresh, new, old) for new, old in pairs))
+            states.append(state)
+        return states
+
+    def remember(self, tensordict: TensorDictBase, states: Sequence[Any], **report: Tensor) -> None:
+        """Store the parts' states, in the order of `slots`, and a ``report`` of `REPORTED`."""
+        entries: dict[str, Tensor] = report
+        for slot, state in zip(self.slots, states, strict=True):
+            entries.update(zip(slot.names, state, strict=True))
+        remember(tensordict, entries)
+
+    def empty(self, observation: Observation) -> dict[str, Tensor]:
+        """The entries of rows that have not begun."""
+        states = [(slot.names, slot.start(observation)) for slot in self.slots]
+        return {name: value for names, state in states for name, value in zip(names, state, strict=True)}
 
 
-def carry_on(memory: Memory | None, tool_pos: Tensor, step_count: Tensor) -> SearchResult:
-    """Meeting of the step before, one step nearer; rows at step 0, and all rows without a memory, `hold`."""
-    holding = hold(tool_pos, step_count)
-    if memory is None:
-        return holding
-    old = memory.meeting
-    fresh = step_count == 0
-    return SearchResult(
-        torch.where(fresh.unsqueeze(-1), holding.goal, old.goal),
-        torch.where(fresh, 0, (old.arrival_steps - 1).clamp_min(0)),
-        old.clamped & ~fresh,
-        old.reachable | fresh,
+def warn_of_loss(name: str, fresh: Tensor) -> None:
+    """Warn if rows that are not ``fresh`` (*B,) have lost the entry ``name`` of their memory."""
+    if torch.compiler.is_compiling() or bool(fresh.all()):
+        return
+    warnings.warn(
+        f"a planner remembers nothing ('plan', {name!r} is absent) in rows that are past step 0, and starts afresh "
+        "there: carry its memory from step to step; an environment does with planner.make_tensordict_primer()",
+        RuntimeWarning,
+        stacklevel=2,
     )
 
 
-def carry_use(tensordict: TensorDictBase, step_count: Tensor) -> Tensor:
-    """Whether the plan in use came from a usable forecast, ``(*B,)``; true where there is none yet."""
-    plan = tensordict.get(keys.PLAN, None)
-    usable = None if plan is None else plan.get(USABLE, None)
-    return torch.ones_like(step_count, dtype=torch.bool) if usable is None else usable | (step_count == 0)
+def remember(tensordict: TensorDictBase, entries: Mapping[str, Tensor]) -> None:
+    """Put ``entries`` below ``plan``; what others keep there stays.
+
+    The memory is a new one at each step: tensordicts of earlier steps may share the old one.
+    """
+    stored = tensordict.get(keys.PLAN, None)
+    whole = dict(entries) if stored is None else dict(stored.items()) | dict(entries)
+    tensordict.set(keys.PLAN, TensorDict(whole, tensordict.batch_size, device=tensordict.device))
+
+
+class Remembering(TensorDictModuleBase):
+    """A planner that keeps its memory in the tensordict under ``plan``."""
+
+    def empty_memory(self, like: Tensor) -> dict[str, Tensor]:
+        """Entries below ``plan`` of rows at step 0, in the batch, type and device of ``like`` (*B, 3); none here."""
+        return {}
+
+    def make_tensordict_primer(self) -> Any:
+        """A TorchRL transform that lets environments carry the memory, `torchrl.envs.TensorDictPrimer`.
+
+        Environments that run in other processes, and collectors over them, carry nothing that no spec declares.
+        """
+        from torchrl.data import Composite, Unbounded
+        from torchrl.envs.transforms import TensorDictPrimer
+
+        entries = self.empty_memory(torch.zeros(3))
+        specs = {name: Unbounded(shape=value.shape, dtype=value.dtype) for name, value in entries.items()}
+        return TensorDictPrimer(Composite({keys.PLAN: Composite(specs)}), default_value=0.0, expand_specs=True)

@@ -6,6 +6,16 @@ import torch
 from torch import Tensor
 
 
+def any_row(mask: Tensor) -> bool:
+    """Whether ``mask`` holds anywhere, so that work for none can be left out; always true while compiling."""
+    return torch.compiler.is_compiling() or bool(mask.any())
+
+
+def where_rows(mask: Tensor, new: Tensor, old: Tensor) -> Tensor:
+    """``new`` (*B, …) in the rows of ``mask`` (*B,), ``old`` in the others."""
+    return torch.where(mask[(..., *[None] * (new.ndim - mask.ndim))], new, old)
+
+
 def apply_to_rows(
     function: Callable[..., Sequence[Tensor]],
     mask: Tensor,
@@ -18,6 +28,7 @@ def apply_to_rows(
 
     Matrix products may differ in the last bit with the number of rows. With ``chunk`` the function always sees exactly
     that many rows (a row is repeated to fill the last block), so that a row's result depends on that row alone.
+    While compiling, where the number of rows must not depend on data, the function sees all of them.
 
     Args:
         function: maps tensors with one leading batch dimension, ``(R, …)`` each, to as many tensors as ``outputs``.
@@ -30,14 +41,21 @@ def apply_to_rows(
     Returns:
         New tensors of the shapes and types of ``outputs``.
     """
+    if torch.compiler.is_compiling():
+        made = function(*(_flat(value, mask.ndim) for value in inputs))
+        pairs = zip(made, outputs, strict=True)
+        return tuple(where_rows(mask, new.to(old.dtype).reshape(old.shape), old) for new, old in pairs)
     rows = mask.reshape(-1).nonzero().squeeze(-1)
     count = rows.numel()
     if count == 0:
         return tuple(outputs)
+    flat = [_flat(value, mask.ndim) for value in inputs]
+    if count == mask.numel() and chunk is None:
+        pairs = zip(function(*flat), outputs, strict=True)
+        return tuple(new.to(old.dtype).reshape(old.shape) for new, old in pairs)
     if chunk is not None:
         padding = rows[-1:].expand(-count % chunk)
         rows = torch.cat([rows, padding])
-    flat = [_flat(value, mask.ndim) for value in inputs]
     blocks = [function(*(value[block] for value in flat)) for block in rows.split(chunk or count)]
     merged = []
     for old, *new in zip(outputs, *blocks, strict=True):
@@ -48,4 +66,6 @@ def apply_to_rows(
 
 def _flat(value: Tensor, batch_ndim: int) -> Tensor:
     """View ``(*B, …)`` as ``(R, …)``."""
-    return value.reshape(-1, *value.shape[batch_ndim:])
+    if batch_ndim == 1:
+        return value
+    return value.unsqueeze(0) if batch_ndim == 0 else value.flatten(0, batch_ndim - 1)

@@ -5,13 +5,19 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass
 from fractions import Fraction
-from typing import ClassVar, NamedTuple, Protocol
+from typing import TYPE_CHECKING, ClassVar, NamedTuple, Protocol
 
 import torch
 from torch import Tensor
 
 from torchdyn_plan.checks import check_number
 from torchdyn_plan.errors import InputError
+from torchdyn_plan.planners.observation import Observation
+from torchdyn_plan.planners.plan import Plan
+from torchdyn_plan.planners.rows import any_row, apply_to_rows
+
+if TYPE_CHECKING:
+    from torchdyn_plan.nets.arrival import ArrivalModel
 
 
 class Clock(NamedTuple):
@@ -24,49 +30,58 @@ class Clock(NamedTuple):
     replans: Tensor
     """Plans begun since the reset."""
 
+    def older(self) -> Clock:
+        """The clock one control step later."""
+        return self._replace(countdown=self.countdown - 1)
 
-class Drift(NamedTuple):
-    """How far the world has moved away from the last plan, ``(*B,)`` each."""
+    @classmethod
+    def until(cls, first_step: int, window: int, step_count: Tensor) -> Clock:
+        """Clock of episodes that are at ``step_count`` (*B,) and plan first at ``first_step``."""
+        countdown = (first_step - step_count).clamp_min(0)
+        return cls(torch.full_like(step_count, window), countdown, torch.zeros_like(step_count))
 
-    miss: Tensor
-    """Distance of the target from where the plan's forecast has it now [m]."""
-    late: Tensor
-    """Predicted time left to the goal less the time left by plan [control steps]; infinite where it never arrives."""
-    over: Tensor
-    """Bool: the planned meeting time has come."""
+    def retry(self, failed: Tensor, before: Clock) -> Clock:
+        """The clock, but rows that ``failed`` (*B,) to plan are due again at the next step.
+
+        ``before`` is the clock before they were due: a plan that failed does not count, and moves no window.
+        """
+        return Clock(
+            torch.where(failed, before.window, self.window),
+            self.countdown.masked_fill(failed, 1),
+            self.replans - failed.long(),
+        )
 
 
-Look = Callable[[Tensor], Drift]
-"""Measures the drift in the rows of a mask ``(*B,)``; its values in other rows mean nothing."""
+Late = Callable[[Tensor], Tensor]
+"""Measures how late robots are, `lateness`, in the rows of a mask ``(*B,)``: ``(*B,)`` [control steps]."""
 
 
 class Schedule(Protocol):
-    """What tells a planner which rows plan now."""
+    """What tells a planner which rows plan now; its state is a `Clock`."""
 
     watches: ClassVar[bool]
-    """Whether it looks at the drift."""
+    """Whether it looks at the plan's path between plans, which is then remembered."""
 
     @property
     def longest(self) -> int:
         """Longest time between two plans [control steps]."""
         ...
 
-    def start(self, step_count: Tensor, /) -> Clock:
-        """Clock of episodes that are at ``step_count`` (*B,) and have no plan yet."""
+    def start(self, observation: Observation, /) -> Clock:
+        """Clock of rows that have no plan yet."""
         ...
 
     def tick(
-        self, clock: Clock | None, step_count: Tensor, /, *, busy: Tensor | None = None, look: Look | None = None
+        self, clock: Clock, observation: Observation, plan: Plan, /, *, busy: Tensor | None, late: Late
     ) -> tuple[Clock, Tensor]:
-        """Advance ``clock`` of the step before to ``step_count`` (*B,) int64, and say which rows plan now.
-
-        Rows at step 0, and all rows if there is no clock, start afresh.
+        """Say which rows plan now.
 
         Args:
-            clock: as it was after the step before.
-            step_count: control steps since the reset.
+            clock: of this step.
+            observation: of this step.
+            plan: in use.
             busy: ``(*B,)`` bool: a plan is under way, and no other can begin; None for nowhere.
-            look: measures how far the last plan has drifted.
+            late: measures how late the robot is.
 
         Returns:
             The clock after this step's plans, and ``(*B,)`` bool: true where a plan begins now.
@@ -116,19 +131,20 @@ class ReplanSchedule:
         shrunk = torch.div(window * ratio.numerator, ratio.denominator, rounding_mode="floor")
         return shrunk.clamp_min(self.minimum)
 
-    def start(self, step_count: Tensor) -> Clock:
-        """Clock of episodes that are at ``step_count`` (*B,) and have no plan yet."""
-        return _start(self.first_step, self.window, step_count)
+    def start(self, observation: Observation) -> Clock:
+        """Clock of rows that have no plan yet."""
+        return Clock.until(self.first_step, self.window, observation.step_count)
 
     def tick(
-        self, clock: Clock | None, step_count: Tensor, *, busy: Tensor | None = None, look: Look | None = None
+        self, clock: Clock, observation: Observation, plan: Plan, *, busy: Tensor | None, late: Late
     ) -> tuple[Clock, Tensor]:
-        """Which rows plan now, as `Schedule.tick` says; the drift is not looked at."""
-        window, countdown, replans = _advance(clock, self.start(step_count), step_count)
-        over = countdown <= 0
+        """Which rows plan now, as `Schedule.tick` says, whatever has become of the plan."""
+        over = clock.countdown <= 0
+        if not (torch.compiler.is_compiling() or over.any()):
+            return clock, over
         due = over if busy is None else over & ~busy
-        window = torch.where(due, self.next_window(window), window)
-        return Clock(window, torch.where(over, window, countdown), replans + due), due
+        window = torch.where(due, self.next_window(clock.window), clock.window)
+        return Clock(window, torch.where(over, window, clock.countdown), clock.replans + due), due
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -170,40 +186,43 @@ class EventSchedule:
         """Longest time between two plans [control steps]."""
         return self.maximum
 
-    def start(self, step_count: Tensor) -> Clock:
-        """Clock of episodes that are at ``step_count`` (*B,) and have no plan yet."""
-        return _start(self.first_step, self.maximum, step_count)
+    def start(self, observation: Observation) -> Clock:
+        """Clock of rows that have no plan yet."""
+        return Clock.until(self.first_step, self.maximum, observation.step_count)
 
     def tick(
-        self, clock: Clock | None, step_count: Tensor, *, busy: Tensor | None = None, look: Look | None = None
+        self, clock: Clock, observation: Observation, plan: Plan, *, busy: Tensor | None, late: Late
     ) -> tuple[Clock, Tensor]:
-        """Which rows plan now, as `Schedule.tick` says; without ``look``, those whose longest time is over.
+        """Which rows plan now, as `Schedule.tick` says.
 
         The clock's countdown runs to the latest next plan, and below 0 where a busy row is overdue.
         """
-        window, countdown, replans = _advance(clock, self.start(step_count), step_count)
+        window, countdown, replans = clock
         passed = window - countdown
         may = (replans > 0) & (passed >= self.minimum) & (passed % self.every == 0)
         due = (countdown <= 0) & (may | (replans == 0))
         if busy is not None:
             due, may = due & ~busy, may & ~busy
         looked = may & ~due
-        if look is not None and looked.any():
-            drift = look(looked)
-            due = due | (looked & ((drift.miss > self.miss) | (drift.late > self.late) | drift.over))
+        if any_row(looked):
+            miss = torch.linalg.vector_norm(plan.ahead(1).squeeze(-2) - observation.target_pos, dim=-1)
+            misfit = (miss > self.miss) | (late(looked) > self.late) | (plan.arrival_steps == 0)
+            due = due | (looked & misfit)
         return Clock(window, torch.where(due, window, countdown), replans + due), due
 
 
-def _start(first_step: int, window: int, step_count: Tensor) -> Clock:
-    """Clock of episodes that are at ``step_count`` (*B,) and have no plan yet."""
-    countdown = (first_step - step_count).clamp_min(0)
-    return Clock(torch.full_like(step_count, window), countdown, torch.zeros_like(step_count))
+def lateness(eta: ArrivalModel, observation: Observation, plan: Plan, chunk: int | None, rows: Tensor) -> Tensor:
+    """How late robots are by their plan [control steps], ``(*B,)``: predicted time to the goal less the planned one.
 
+    Infinite where a robot never arrives; values outside of ``rows`` (*B,) bool mean nothing. ``eta`` sees ``chunk``
+    rows at once.
+    """
 
-def _advance(clock: Clock | None, start: Clock, step_count: Tensor) -> Clock:
-    """``clock`` one step later; ``start`` in rows at step 0, and everywhere if there is no clock."""
-    if clock is None:
-        return start
-    aged = Clock(clock.window, clock.countdown - 1, clock.replans)
-    fresh = step_count == 0
-    return Clock(*(torch.where(fresh, new, old) for new, old in zip(start, aged, strict=True)))
+    def measure(robot_state: Tensor, goal: Tensor, planned_steps: Tensor) -> tuple[Tensor]:
+        arrival = eta.arrival(robot_state.unsqueeze(-2), goal.unsqueeze(-2), estimator="expectation")
+        eta_steps = arrival.steps.masked_fill(arrival.never, torch.inf).squeeze(-1)
+        return (eta_steps - planned_steps,)
+
+    inputs = observation.robot_state, plan.goal, plan.arrival_steps
+    on_time = torch.zeros_like(observation.target_pos[..., 0])
+    return apply_to_rows(measure, rows, inputs, (on_time,), chunk=chunk)[0]

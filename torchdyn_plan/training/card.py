@@ -1,17 +1,32 @@
 """The card beside a network: what it was made with and how well it does."""
 
+from __future__ import annotations
+
 import json
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import asdict
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
+
+import torch
 
 from torchdyn_plan.errors import InputError
-from torchdyn_plan.files import write_whole
+from torchdyn_plan.files import write_json, write_whole
 from torchdyn_plan.versions import library_versions, machine
+
+if TYPE_CHECKING:
+    from torchdyn_plan.nets.eta import ETANetwork
+    from torchdyn_plan.nets.forecaster import Forecaster
+    from torchdyn_plan.nets.spread import SpreadNetwork
+    from torchdyn_plan.training.optimise import Recipe
+
+Rows = list[dict[str, Any]]
+Tables = dict[str, Rows]
+"""Rows of figures by caption."""
 
 
 def read_description(data: Path, stem: str, *, scene: str) -> dict[str, Any]:
-    """What ``data`` says of its ``stem-*.safetensors``: arguments of each collection, and the scene's digest.
+    """What ``data`` says of its ``stem-*.safetensors``: ``data``, arguments of each collection, and ``scene``.
 
     Args:
         data: folder of `torchdyn_plan.training.collect`.
@@ -33,8 +48,34 @@ def read_description(data: Path, stem: str, *, scene: str) -> dict[str, Any]:
         except (OSError, ValueError, KeyError, TypeError) as error:
             raise InputError(f"{str(file)!r} is no description of collected data: {error!r}") from error
         if found != scene:
-            raise InputError(f"{str(file)!r} tells of scene {found}, but the scene is {scene}: collect the data anew")
-    return {"arguments": arguments, "scene": scene}
+            raise InputError(f"{str(file)!r} tells of scene {found}, but the scene is {scene}: collect the data again")
+    return {"data": arguments, "scene": scene}
+
+
+def write_network(
+    network: Forecaster | ETANetwork | SpreadNetwork,
+    folder: Path,
+    score: Callable[[], Tables],
+    *,
+    task: str,
+    recipe: Recipe,
+    facts: Mapping[str, Any],
+) -> Path:
+    """Write a fitted network, its scores as ``scores.json`` and its card into ``folder``; returns the weights' file."""
+    network.eval()
+    with torch.no_grad():
+        tables = score()
+    file = network.save_pretrained(folder)
+    write_json(folder / "scores.json", tables)
+    given = f"--steps {recipe.steps} --batch {recipe.batch} --lr {recipe.lr:g} --seed {recipe.seed}"
+    facts = {
+        "command": f"`torchdyn-plan train {network.kind} --task {task} {given}`",
+        "recipe": asdict(recipe),
+        **facts,
+        "network": asdict(network.config),
+    }
+    write_card(file.with_suffix(".md"), f"{type(network).__name__} of {task}", facts, tables)
+    return file
 
 
 def write_card(
@@ -58,7 +99,7 @@ def _plain(value: Any) -> str:
 
 
 def _table(rows: Sequence[Mapping[str, Any]]) -> list[str]:
-    names = list(rows[0])
+    names = list(rows[0]) if rows else ["none"]
     lines = [names, ["---"] * len(names)]
     lines += [["–" if row[name] is None else _plain(row[name]) for name in names] for row in rows]
     return [f"| {' | '.join(line)} |" for line in lines]

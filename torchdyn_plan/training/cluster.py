@@ -58,13 +58,19 @@ class ClusterDDPG(DDPG):
             for worker in range(self.workers)
         ]
         return RayCollector(
-            makers, policy, frames_per_batch=self.frames, total_frames=self.recipe.iterations * self.frames, sync=True,
-            update_after_each_batch=True, ray_init_config=self.cluster,
-            remote_configs={"num_cpus": 1, "num_gpus": 0}, init_random_frames=self.recipe.warmup * self.frames,
-        )  # fmt: skip
+            makers,
+            policy,
+            frames_per_batch=self.frames,
+            total_frames=self.recipe.iterations * self.frames,
+            sync=True,
+            update_after_each_batch=True,
+            ray_init_config=self.cluster,
+            remote_configs={"num_cpus": 1, "num_gpus": 0},
+            init_random_frames=self.recipe.warmup * self.frames,
+        )
 
     def restart_collection(self, episode: int) -> None:
-        """Nothing to do: workers begin their series anew."""
+        """Nothing to do: workers start their series over."""
 
 
 def _make_env(task: GoalTask, num_envs: int, seed: int) -> EnvBase:

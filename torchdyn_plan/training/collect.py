@@ -1,10 +1,10 @@
-"""Training data by simulation: paths of the rolling ball, and arrivals of a static planner."""
+"""Training data by simulation, in shards: paths of a task's targets, and arrivals of its static planners."""
 
 from __future__ import annotations
 
-import dataclasses
 import hashlib
-from collections.abc import Iterator
+from collections.abc import Callable, Mapping
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
@@ -13,75 +13,158 @@ from safetensors import SafetensorError, safe_open
 from safetensors.torch import save_file
 from torch import Tensor
 
-from torchdyn_plan.cli_arguments import CollectArguments
-from torchdyn_plan.envs.episodes import draw_starts
-from torchdyn_plan.envs.fetch import fetch_digest
-from torchdyn_plan.envs.reaching import ReachingTask
-from torchdyn_plan.envs.scene import TrapperScene
-from torchdyn_plan.envs.simulation import TrapperSimulation
-from torchdyn_plan.envs.trapping import is_pocketed
+from torchdyn_plan.checks import check_choice, check_number
 from torchdyn_plan.errors import InputError
 from torchdyn_plan.files import write_json, write_whole
-from torchdyn_plan.planners import STATIC_PLANNERS, PolicyPlanner, StaticPlanner
-from torchdyn_plan.training.reach_data import record_fetch_runs, record_goal_paths
-from torchdyn_plan.training.runs import record_runs, trapper_runs
+from torchdyn_plan.nets.policy import Actor
+from torchdyn_plan.planners import PolicyPlanner, StaticPlanner
+from torchdyn_plan.tasks.task import Task, load_task
+from torchdyn_plan.threads import one_thread
 from torchdyn_plan.versions import library_versions
 
-PATH_STEPS = 2000
-"""Control steps of a recorded path: four times an episode (paper, Section IV)."""
-FASTEST = 5.0
-"""Balls start with velocities up to this [m/s]."""
+SHARD = {"paths": 1024, "arrivals": 2048}
+"""Episodes in a shard of each kind of data; of arrivals, sequences of runs."""
+ENTRIES = {
+    "paths": ("positions", "start", "length", "pocketed", "velocity"),
+    "arrivals": ("robot_state", "goal", "arrival", "run"),
+}
+"""Tensors in a shard of each kind of data."""
+SERIES = 1_000_003
+"""Seeds of draws are this many times the series' seed, plus a number within the series: no two series share one."""
 
 
-def collect(arguments: CollectArguments, planner: StaticPlanner | None = None, *, name: str = "own") -> None:
-    """Write the shards that ``arguments`` ask for, and a description of them; whole shards that there are are kept.
+def collect(
+    task: Task | str,
+    what: str,
+    out: Path,
+    *,
+    episodes: int = 20_000,
+    seed: int = 0,
+    num_envs: int = 256,
+    num_threads: int = 0,
+    static: str | None = None,
+    weights: Path | None = None,
+    planner: StaticPlanner | None = None,
+    name: str = "own",
+) -> None:
+    """Write shards of data and a description of them into ``out``; whole shards that are there are kept.
 
     Args:
-        arguments: what, how much and where to.
-        planner: a person's own static planner, whose arrivals are measured in place of those of ``arguments.static``.
+        task: whose data, or its name.
+        what: ``paths`` of targets for a forecaster, or ``arrivals`` of a static planner for an arrival-time network.
+        out: folder; paths and arrivals of one scene may lie in it side by side.
+        episodes: paths, or sequences of runs.
+        seed: which series of episodes.
+        num_envs: episodes that run side by side; numbers of a block are drawn together.
+        num_threads: of the simulation, 0 for all cores; does not change the data.
+        static: name of the static planner whose arrivals are measured; the task's default for None.
+        weights: policy of that static planner, a file or a folder of its training; the one that ships for None.
+        planner: a person's own static planner, whose arrivals are measured in place of those of ``static``.
         name: what the description calls it.
 
     Raises:
-        InputError: a shard that is there was made in another scene or otherwise than ``arguments`` say, or is damaged.
+        InputError: the task records no such data, an argument is wrong, or a shard that is there was made in another
+            scene or with other arguments, or is damaged.
+        WeightsError: there are no such weights.
         OutputError: the folder cannot be written to.
     """
     from tqdm import tqdm
 
-    torch.set_num_threads(1)
-    static = arguments.static if planner is None else name
-    driver = planner or _driver(arguments)
-    scene = task_digest(arguments.task)
-    record = RECORDERS[arguments.task, arguments.what]
-    shards = -(-arguments.episodes // SHARD[arguments.what])
-    for index in tqdm(range(shards), desc=f"collect {arguments.what}", unit="shard"):
-        path = arguments.out / f"{arguments.what}-{arguments.seed}-{index:03d}.safetensors"
-        made = _made(arguments, scene, index, static)
-        if path.exists() and _is_kept(path, made):
-            continue
-        tensors = record(arguments, index, driver)
-        write_whole(path, lambda temporary, tensors=tensors, made=made: save_file(tensors, temporary, made))
-    fields = {key: str(value) if isinstance(value, Path) else value for key, value in _fields(arguments).items()}
-    fields["static"] = static
-    about = {"arguments": fields, "scene": scene, "versions": library_versions()}
-    write_json(arguments.out / f"{arguments.what}-{arguments.seed}.json", about)
+    task = load_task(task)
+    check_choice("kind of data", what, SHARD)
+    if weights is not None and (what != "arrivals" or planner is not None):
+        raise InputError(f"weights are of the task's own static planner, whose arrivals are measured, got {weights}")
+    driver = name if planner is not None else static or task.default_static
+    file = None if weights is None else str(Actor.find(weights))
+    wanted = _Wanted(task.name, what, str(out), episodes, seed, num_envs, num_threads, driver, file)
+    with one_thread():
+        record = _recorder(task, wanted, planner)
+        for index in tqdm(range(wanted.shards), desc=f"collect {what}", unit="shard"):
+            path = out / f"{what}-{seed}-{index:03d}.safetensors"
+            made = wanted.metadata(index, task.digest())
+            if path.exists() and _is_kept(path, made):
+                continue
+            tensors = _whole(wanted, record(index))
+            write_whole(path, lambda temporary, tensors=tensors, made=made: save_file(tensors, temporary, made))
+    about = {"arguments": asdict(wanted), "scene": task.digest(), "versions": library_versions()}
+    write_json(out / f"{what}-{seed}.json", about)
 
 
-SHARD = {"paths": 1024, "arrivals": 2048}
-"""Episodes in a shard."""
+@dataclass(frozen=True)
+class _Wanted:
+    """What a collection was asked for: the arguments in its description."""
+
+    task: str
+    what: str
+    out: str
+    episodes: int
+    seed: int
+    num_envs: int
+    num_threads: int
+    static: str
+    weights: str | None = None
+
+    def __post_init__(self) -> None:
+        for name, minimum in (("episodes", 1), ("num_envs", 1), ("seed", 0), ("num_threads", 0)):
+            check_number(name, getattr(self, name), minimum=minimum, integer=True)
+
+    @property
+    def shards(self) -> int:
+        """How many shards there are."""
+        return -(-self.episodes // SHARD[self.what])
+
+    def blocks(self, index: int) -> list[Tensor]:
+        """Episode numbers of a shard, ``num_envs`` at a time."""
+        size = SHARD[self.what]
+        last = min((index + 1) * size, self.episodes)
+        starts = range(index * size, last, self.num_envs)
+        return [torch.arange(first, min(first + self.num_envs, last)) for first in starts]
+
+    def metadata(self, index: int, scene: str) -> dict[str, str]:
+        """What decides a shard's numbers, beside its name."""
+        episodes = sum(map(len, self.blocks(index)))
+        made = {"scene": scene, "num_envs": str(self.num_envs), "episodes": str(episodes)}
+        if self.what == "arrivals":
+            made["static"] = self.static
+        if self.weights is not None:
+            made["weights"] = hashlib.sha256(Path(self.weights).read_bytes()).hexdigest()[:16]
+        return made
 
 
-def _fields(arguments: CollectArguments) -> dict[str, Any]:
-    return dataclasses.asdict(arguments)
+def _recorder(task: Task, wanted: _Wanted, planner: StaticPlanner | None) -> Callable[[int], dict[str, Tensor]]:
+    """What fills a shard by its index; raises `InputError` if the task has nothing that does."""
+    threads = wanted.num_threads
+    if wanted.what == "paths":
+        record_paths = task.record_paths
+        if record_paths is None:
+            raise InputError(f"{task.name} records no paths")
+        return lambda index: record_paths(wanted.blocks(index), seed=wanted.seed, num_threads=threads)
+    record_arrivals = task.record_arrivals
+    if record_arrivals is None:
+        raise InputError(f"{task.name} records no arrivals")
+    driver = planner or _static_planner(task, wanted)
+    return lambda index: record_arrivals(
+        driver,
+        num_envs=wanted.num_envs,
+        sequences=len(wanted.blocks(index)),
+        seed=wanted.seed * SERIES + index,
+        num_threads=threads,
+    )
 
 
-def _made(arguments: CollectArguments, scene: str, index: int, static: str) -> dict[str, str]:
-    """What decides a shard's numbers: its metadata."""
-    episodes = sum(map(len, _shard_rows(arguments, index)))
-    shared = {"scene": scene, "num_envs": str(arguments.num_envs), "episodes": str(episodes)}
-    if arguments.what == "paths":
-        return shared
-    weights = {} if arguments.weights is None else {"weights": _digest(policy_file(arguments.weights))}
-    return shared | {"static": static} | weights
+def _static_planner(task: Task, wanted: _Wanted) -> Any:
+    made = task.static_planner(wanted.static, weights=wanted.weights)
+    if wanted.weights is not None and not isinstance(made, PolicyPlanner):
+        raise InputError(f"weights are of a policy, but {wanted.static} of {task.name} is none: got {wanted.weights}")
+    return made
+
+
+def _whole(wanted: _Wanted, tensors: Mapping[str, Tensor]) -> dict[str, Tensor]:
+    """What was recorded, as it can be written; raises `InputError` where the task's recorder left something out."""
+    missing = [name for name in ENTRIES[wanted.what] if name not in tensors]
+    if missing:
+        raise InputError(f"what {wanted.task} records of {wanted.what} lacks {', '.join(missing)}")
+    return {name: value.contiguous() for name, value in tensors.items()}
 
 
 def _is_kept(path: Path, made: dict[str, str]) -> bool:
@@ -98,113 +181,3 @@ def _is_kept(path: Path, made: dict[str, str]) -> bool:
                 f"{str(path)!r} is of another collection: {name} is {there[name]} there, {made[name]} here"
             )
     return not differing
-
-
-def _shard_rows(arguments: CollectArguments, index: int) -> Iterator[Tensor]:
-    """Episode numbers of a shard, ``num_envs`` at a time."""
-    size = SHARD[arguments.what]
-    last = min((index + 1) * size, arguments.episodes)
-    for first in range(index * size, last, arguments.num_envs):
-        yield torch.arange(first, min(first + arguments.num_envs, last))
-
-
-def _paths(arguments: CollectArguments, index: int, _: StaticPlanner) -> dict[str, Tensor]:
-    """Balls rolled alone (the arm at home touches none), each at a velocity of its own up to `FASTEST`."""
-    scene, paths, speeds = TrapperScene(), [], []
-    for episodes in _shard_rows(arguments, index):
-        place, velocity = draw_starts(scene, episodes, velocity=1.0, split="train", seed=arguments.seed)
-        draw = torch.Generator().manual_seed(arguments.seed * 1_000_003 + int(episodes[0]))
-        speed = FASTEST * torch.rand(len(episodes), generator=draw, dtype=torch.float64)
-        paths.append(_record(scene, place, velocity * speed.unsqueeze(-1), PATH_STEPS, threads=arguments.threads))
-        speeds.append(speed.float())
-    return _flatten(torch.cat(paths), torch.cat(speeds), scene)
-
-
-def roll(
-    scene: TrapperScene, episodes: Tensor, *, steps: int, velocity: float, friction: float, split: str, seed: int
-) -> dict[str, Tensor]:
-    """Balls of ``episodes`` rolled alone for ``steps`` control steps, at ``friction`` [N]: entries as of a shard."""
-    place, speed = draw_starts(scene, episodes, velocity=velocity, split=split, seed=seed)
-    paths = _record(scene, place, speed, steps, friction=friction, threads=1)
-    return _flatten(paths, torch.full((len(episodes),), velocity), scene)
-
-
-def _record(
-    scene: TrapperScene, place: Tensor, velocity: Tensor, steps: int, *, friction: float = 0.0, threads: int
-) -> Tensor:
-    """Positions ``(M, steps + 1, 3)`` [m, world] of balls that start at ``place`` with ``velocity``, (M, 2) each."""
-    simulation = TrapperSimulation(len(place), scene, friction=friction, num_threads=threads, arm=False)
-    simulation.reset(torch.arange(len(place)), place, velocity)
-    record = torch.empty(len(place), steps + 1, 3)
-    record[:, 0] = simulation.ball_pos
-    for step in range(1, steps + 1):
-        simulation.step()
-        record[:, step] = simulation.ball_pos
-    return record
-
-
-def _flatten(paths: Tensor, speeds: Tensor, scene: TrapperScene) -> dict[str, Tensor]:
-    """Cut each path where its ball is swallowed and lay them end to end."""
-    sunk = is_pocketed(scene, paths)
-    pocketed = sunk.any(-1)
-    length = torch.where(pocketed, sunk.to(torch.int64).argmax(-1) + 1, paths.shape[1])
-    kept = torch.arange(paths.shape[1]) < length.unsqueeze(-1)
-    start = length.cumsum(0) - length
-    return {"positions": paths[kept], "start": start, "length": length, "pocketed": pocketed, "velocity": speeds}
-
-
-def policy_file(weights: Path) -> Path:
-    """File of the policy that is a file, or lies in a folder of its training; raises `InputError` if there is none."""
-    choices = (weights, weights / "policy.safetensors", weights / "policy" / "policy.safetensors")
-    for choice in choices:
-        if choice.is_file():
-            return choice
-    raise InputError(f"no policy at {str(weights)!r}: it is neither a file nor a folder of a training")
-
-
-def _digest(file: Path) -> str:
-    return hashlib.sha256(file.read_bytes()).hexdigest()[:16]
-
-
-def _driver(arguments: CollectArguments) -> StaticPlanner:
-    """The static planner that ``arguments`` name."""
-    if arguments.weights is None:
-        return STATIC_PLANNERS[arguments.task][arguments.static]()
-    return PolicyPlanner.from_pretrained(policy_file(arguments.weights))
-
-
-def _arrivals(arguments: CollectArguments, index: int, planner: StaticPlanner) -> dict[str, Tensor]:
-    """Runs of the static planner, whole sequences of every arm."""
-    scene = TrapperScene()
-    task = ReachingTask(planner, arguments.num_envs, scene=scene, num_threads=arguments.threads)
-    runs = trapper_runs(scene, restless=getattr(planner, "restless", False))
-    draw = torch.Generator().manual_seed(arguments.seed * 1_000_003 + index)
-    parts = [record_runs(task, runs, draw) for _ in _shard_rows(arguments, index)]
-    return {name: torch.cat([part[name] for part in parts]) for name in parts[0]}
-
-
-def _goal_paths(arguments: CollectArguments, index: int, _: StaticPlanner) -> dict[str, Tensor]:
-    """Goals of Reach, no gripper near."""
-    return record_goal_paths(torch.cat(list(_shard_rows(arguments, index))), seed=arguments.seed)
-
-
-def _fetch_arrivals(arguments: CollectArguments, index: int, planner: StaticPlanner) -> dict[str, Tensor]:
-    """Runs of the static planner of the Fetch arm."""
-    return record_fetch_runs(
-        planner, arguments.num_envs, len(list(_shard_rows(arguments, index))),
-        seed=arguments.seed * 1_000_003 + index, num_threads=arguments.threads,
-    )  # fmt: skip
-
-
-RECORDERS = {
-    ("trapper", "paths"): _paths,
-    ("trapper", "arrivals"): _arrivals,
-    ("reach", "paths"): _goal_paths,
-    ("reach", "arrivals"): _fetch_arrivals,
-}
-"""What fills a shard, for each task and kind of data."""
-
-
-def task_digest(task: str) -> str:
-    """Hash of the scene that a task's data belongs to."""
-    return TrapperScene().digest() if task == "trapper" else fetch_digest()

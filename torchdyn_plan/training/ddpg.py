@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator
-from functools import partial
 from typing import Any
 
 import torch
@@ -20,7 +19,7 @@ from torchdyn_plan.errors import TrainingError
 from torchdyn_plan.nets.policy import Actor, Critic
 from torchdyn_plan.training.checkpoint import group
 from torchdyn_plan.training.exploration import BoundedTD0, PenalisedDDPGLoss, RandomActionModule
-from torchdyn_plan.training.goal_task import SEEN, DDPGRecipe, GoalReplay, GoalTask, hindsight_replay
+from torchdyn_plan.training.goal_task import SEEN, DDPGRecipe, GoalReplay, GoalTask
 from torchdyn_plan.training.optimise import check_device
 
 
@@ -47,7 +46,7 @@ class DDPG:
         for parameters in groups:
             parameters["params"] = [entry for entry in parameters["params"] if isinstance(entry, nn.Parameter)]
         self.optimiser = torch.optim.Adam(groups, fused=True)
-        self.replay: GoalReplay = getattr(task, "make_replay", partial(hindsight_replay, task))(recipe, self.device)
+        self.replay: GoalReplay = task.make_replay(recipe, self.device)
         self.env: Any = task.make_env(recipe.num_envs, seed=recipe.seed)
         spec = self.env.action_spec_unbatched
         self.random = RandomActionModule(spec, recipe.random_share)
@@ -169,7 +168,7 @@ class DDPG:
         torch.set_rng_state(tensors["generator"])
 
     def restart_collection(self, episode: int) -> None:
-        """Let the environments begin anew, so that the next reset after this one takes number ``episode``."""
+        """Start the environments over, so that the next reset after this one takes number ``episode``."""
         # Episodes end all at once: the simulators are at a reset, which their episodes' numbers decide.
         self.env.start_from(episode - self.recipe.num_envs)
         self.collector.reset()

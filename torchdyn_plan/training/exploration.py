@@ -15,7 +15,11 @@ from torchdyn_plan import keys
 
 
 class RandomActionModule(TensorDictModuleBase):
-    """Replaces a share of the actions by random ones, as hindsight replay's authors do (Andrychowicz et al., 2017)."""
+    """Replaces a share of the actions by random ones, as hindsight replay's authors do (Andrychowicz et al., 2017).
+
+    TorchRL's `EGreedyModule`, but that it draws on the CPU wherever the policy runs: checkpoints hold that generator
+    alone, and a training that is resumed must draw the same.
+    """
 
     def __init__(self, spec: Any, share: float) -> None:
         """Draw from ``spec``, of one environment, with probability ``share`` a row."""

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from abc import ABC, abstractmethod
+from dataclasses import dataclass, replace
 from typing import Any, Protocol
 
 import torch
@@ -45,41 +46,42 @@ class GoalReplay(Protocol):
         ...
 
 
-def hindsight_replay(task: GoalTask, recipe: DDPGRecipe, device: torch.device) -> HindsightReplayBuffer:
-    """The buffer of hindsight experience replay."""
-    return HindsightReplayBuffer(
-        task.reward, capacity=recipe.capacity, length=task.length, batch_size=recipe.batch, her_ratio=recipe.her_ratio,
-        device=device,
-    )  # fmt: skip
-
-
-class GoalTask(Protocol):
-    """A task of reaching goals, as the training sees it.
-
-    One whose goals need another replay than `hindsight_replay` also has ``make_replay(recipe, device) -> GoalReplay``.
-    """
+class GoalTask(ABC):
+    """A task of reaching goals, as the training sees it."""
 
     policy_config: PolicyConfig
-    stored: tuple[Any, ...]
+    """Sizes of the networks."""
+    stored: tuple[Any, ...] = ()
     """Keys of a transition that `reward` reads, beside those that every learner needs."""
     length: int
     """Actions in an episode; all episodes have as many."""
 
+    @abstractmethod
     def make_env(self, num_envs: int, *, seed: int) -> EnvBase:
         """A batch of environments whose episodes all end after ``length`` actions."""
-        ...
 
+    @abstractmethod
     def reward(self, transitions: TensorDictBase) -> Tensor:
         """Rewards ``(B, 1)`` of transitions for the ``desired_goal`` that they have."""
-        ...
 
+    @abstractmethod
     def score(self, actor: Actor) -> dict[str, float]:
         """How well ``actor`` does without exploration; ``success`` is one of the figures."""
-        ...
 
+    @abstractmethod
     def settings(self) -> dict[str, Any]:
         """What must be the same when a training is continued: JSON values."""
-        ...
+
+    def make_replay(self, recipe: DDPGRecipe, device: torch.device) -> GoalReplay:
+        """What transitions are kept in and sampled from: hindsight experience replay, unless a task says otherwise."""
+        return HindsightReplayBuffer(
+            self.reward,
+            capacity=recipe.capacity,
+            length=self.length,
+            batch_size=recipe.batch,
+            her_ratio=recipe.her_ratio,
+            device=device,
+        )
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -139,3 +141,7 @@ class DDPGRecipe:
         """Factor of the learning rates in ``iteration`` (0 … iterations-1)."""
         cosine = 0.5 * (1.0 + math.cos(math.pi * iteration / self.iterations))
         return self.final_rate + (1.0 - self.final_rate) * cosine
+
+    def with_rate(self, lr: float) -> DDPGRecipe:
+        """The recipe with ``lr`` as the critic's learning rate, and the actor's in the same proportion to it."""
+        return replace(self, lr_critic=lr, lr_actor=lr * (self.lr_actor / self.lr_critic))

@@ -6,18 +6,18 @@ from collections.abc import Callable
 from typing import Any
 
 import torch
-from tensordict import TensorDict, TensorDictBase
+from tensordict import TensorDictBase
 from torch import Tensor
-from torchrl.data import HERReplayBuffer, LazyTensorStorage
+from torchrl.data import HERReplayBuffer
 from torchrl.data.replay_buffers.storages import Storage
 
 from torchdyn_plan import keys
-from torchdyn_plan.errors import InputError
+from torchdyn_plan.training.episode_replay import EpisodeReplayBuffer, episode_storage
 
 NEXT_ACHIEVED = ("next", keys.ACHIEVED_GOAL)
 
 
-class HindsightReplayBuffer(HERReplayBuffer):
+class HindsightReplayBuffer(EpisodeReplayBuffer, HERReplayBuffer):
     """TorchRL's `HERReplayBuffer` for episodes of one length, strategy *future*.
 
     Replaces of the upstream: the key of its cache of episode ends (it holds a tensor, and comparing two of them raises
@@ -50,23 +50,15 @@ class HindsightReplayBuffer(HERReplayBuffer):
         Raises:
             InputError: ``capacity`` holds no episode.
         """
-        if capacity < length:
-            raise InputError(f"capacity must hold an episode of {length} transitions, got {capacity}")
         super().__init__(
             reward_fn,
             her_ratio=her_ratio,
             strategy="future",
             achieved_goal_key=NEXT_ACHIEVED,
-            storage=LazyTensorStorage(capacity - capacity % length, device=device),
+            storage=episode_storage(capacity, length, device),
             batch_size=batch_size,
         )
         self.length = length
-
-    def extend_episodes(self, episodes: TensorDictBase) -> None:
-        """Add whole ``episodes``, batch ``(*N, length)``."""
-        if episodes.batch_size[-1] != self.length:
-            raise InputError(f"episodes must have {self.length} transitions, got {episodes.batch_size[-1]}")
-        self.extend(episodes.reshape(-1))
 
     def _get_episode_ends(self, storage: Storage) -> Tensor:
         return torch.arange(self.length - 1, len(self), self.length)
@@ -83,25 +75,3 @@ class HindsightReplayBuffer(HERReplayBuffer):
         data, info = super()._sample(batch_size)
         data.set(("next", keys.DESIRED_GOAL), data.get(keys.DESIRED_GOAL))
         return data, info
-
-    def tensors(self) -> dict[str, Tensor]:
-        """What is stored, by flat names, in the order of storage."""
-        stored = self._storage[: len(self)]
-        return {".".join(key) if isinstance(key, tuple) else key: value for key, value in stored.items(True, True)}
-
-    def restore(self, tensors: dict[str, Tensor], cursor: int) -> None:
-        """Fill an empty buffer with what `tensors` gave, the next episode going to ``cursor``."""
-        nested = {tuple(name.split(".")): value for name, value in tensors.items()}
-        count = len(next(iter(nested.values())))
-        entries = TensorDict({}, batch_size=[count])
-        for name, value in nested.items():
-            entries.set(name, value)
-        self.extend(entries)
-        writer: Any = self._writer
-        writer._cursor = cursor
-
-    @property
-    def cursor(self) -> int:
-        """Where the next episode goes."""
-        writer: Any = self._writer
-        return int(writer._cursor)

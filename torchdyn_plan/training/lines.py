@@ -1,4 +1,4 @@
-"""Recorded paths as unfolded lines: what the forecaster is trained on where a table has cushions."""
+"""Recorded paths as lines that run on through cushions: what the forecaster is trained on where there are some."""
 
 from typing import NamedTuple
 
@@ -12,7 +12,7 @@ SLOWEST = 2e-6
 
 
 class Lines(NamedTuple):
-    """Unfolded lines of all paths, end to end, and how to see them from any of their samples."""
+    """Unreflected lines of all paths, end to end, and how to see them from any of their samples."""
 
     track: Tensor
     """(T, 3): level coordinates on the line, and the height [m]."""
@@ -22,11 +22,11 @@ class Lines(NamedTuple):
     """(T, 2): how far along the line the sample's stretch of table lies [m]."""
 
 
-def unfold_paths(positions: Tensor, start: Tensor, half_extent: float | None) -> Lines:
+def unreflect_paths(positions: Tensor, start: Tensor, half_extent: float | None) -> Lines:
     """Mirror each path at each of its bounces, so that it runs on as one line.
 
     A bounce turns a coordinate from heading into the nearest cushion to heading out of it; however long the target
-    dwells in a soft cushion, it counts once. Coordinates beyond a cushion, a swallowed target's too, count as on it.
+    dwells in a soft cushion, it counts once. Coordinates beyond a cushion, a lost target's too, count as on it.
 
     Args:
         positions: ``(T, 3)`` [m, world], one a control step, paths end to end.

@@ -6,35 +6,32 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from torchdyn_plan.nets.eta import READINGS
+from torchdyn_plan.nets.eta import ESTIMATORS
 from torchdyn_plan.nets.spread import Spread
+from torchdyn_plan.planners import Lost
 from torchdyn_plan.training.windows import Windows
 
-AHEAD = (25, 100, 300)
-"""Control steps ahead at which forecasts are scored; those beyond a network's horizon are left out."""
-STILL = 0.05
-"""Joint speed below which an arm is at rest [rad/s]."""
 FAST = 0.004
 """Motion from which a target is fast [m a step]."""
 SHARES = (0.5, 0.8, 0.9, 0.95)
 """Probabilities of the intervals whose coverage is reported."""
-NEAR = 0.055
-"""Distance along both axes within which a waiting box has the target [m]."""
+NEAR = 0.05
+"""Distance along both level axes within which a robot that waits has the target [m]."""
 SOON = 30
-"""Arrivals within fewer steps than this are scored apart too."""
+"""Arrivals within fewer control steps than this are scored on their own, too."""
 
 
 def forecast_errors(
-    forecast: Tensor, windows: Windows, *, ahead: Sequence[int] = AHEAD, fast: float = FAST
+    forecast: Tensor, windows: Windows, *, ahead: Sequence[int], fast: float = FAST
 ) -> list[dict[str, Any]]:
     """Distances between forecast and truth, beside those of constant velocity.
 
-    Windows whose target moves are told apart: ``full`` and ``padded`` histories of targets that stay on the table,
-    those of them that are ``fast`` at the present, and ``pocketed`` ones, scored while the target is not yet swallowed.
-    Targets that lie still are ``still``.
+    Windows are scored by kind: ``full`` and ``padded`` histories of targets that move and are not lost, those of them
+    that are ``fast`` at the present, ``lost`` ones, scored while the target is not yet lost, and ``still`` ones, whose
+    target lies still.
 
     Args:
-        forecast: ``(n, F, 3)`` [m, world], on the table (not unfolded).
+        forecast: ``(n, F, 3)`` [m, world], as cushions reflect it.
         windows: of n targets, whose ``future`` is the path itself.
         ahead: control steps ahead that are scored, but for those beyond the horizon.
         fast: motion from which a target is fast [m a step].
@@ -56,96 +53,116 @@ def forecast_errors(
     return rows
 
 
-def _kinds(windows: Windows, fast: float = FAST) -> dict[str, Tensor]:
+def _kinds(windows: Windows, fast: float) -> dict[str, Tensor]:
     """Masks ``(n,)`` of the windows that are scored together."""
     padded = windows.history_length < windows.history.shape[-2]
-    stays, moving = ~windows.pocketed, windows.moving
+    stays, moving = ~windows.lost, windows.moving
     step = windows.history[:, -1] - windows.history[:, -2]
     return {
         "full": moving & stays & ~padded,
         "padded": moving & stays & padded,
         "fast": moving & stays & (step.norm(dim=-1) >= fast),
-        "pocketed": moving & windows.pocketed,
+        "lost": moving & windows.lost,
         "still": ~moving,
     }
 
 
-def coverage(forecast: Tensor, spread: Spread, windows: Windows) -> list[dict[str, Any]]:
+def coverage(
+    forecast: Tensor,
+    spread: Spread,
+    windows: Windows,
+    *,
+    ahead: Sequence[int],
+    fast: float = FAST,
+    near: float = NEAR,
+) -> list[dict[str, Any]]:
     """How often errors lie within the intervals that should hold a share of them, axes pooled.
 
     Args:
         forecast: ``(n, F, 3)`` [m, world].
         spread: of the forecasts.
         windows: of n targets, whose ``future`` is the path itself.
+        ahead: control steps ahead that are scored, but for those beyond the horizon.
+        fast: motion from which a target is fast [m a step].
+        near: distance along both level axes that is asked for [m].
 
     Returns:
-        A row for each kind of window (as `forecast_errors` tells them apart) and each of `AHEAD`: ``windows, ahead,
-        count, within_50, within_80, within_90, within_95`` shares of errors, the median ``half_width_90`` [m], and
-        the mean probability ``near_told`` of being within `NEAR` along both axes beside its share ``near``.
+        A row for each kind of window (as in `forecast_errors`) and each of ``ahead``: ``windows, ahead, count,
+        within_50, within_80, within_90, within_95`` shares of errors, the median ``half_width_90`` [m], and the mean
+        predicted probability ``near_predicted`` of being within ``near`` along both axes beside its share ``near``.
     """
     error = (forecast - windows.future)[..., :2].abs()
     rows = []
-    for kind, chosen in _kinds(windows).items():
-        for ahead in (ahead for ahead in AHEAD if ahead <= forecast.shape[-2]):
-            scored = chosen & windows.recorded[:, ahead - 1]
-            told = Spread(*(part[scored, ahead - 1] for part in spread))
-            size = error[scored, ahead - 1]
-            held = {f"within_{100 * s:.0f}": _mean((size <= told.interval(s)).float().mean(-1)) for s in SHARES}
-            near = _mean((size <= NEAR).all(-1).float())
-            told_near = _mean(told.within(NEAR).prod(-1))
-            width = {"half_width_90": _median(told.interval(0.9).flatten()), "near_told": told_near, "near": near}
-            rows.append({"windows": kind, "ahead": ahead, "count": int(scored.sum())} | held | width)
+    for kind, chosen in _kinds(windows, fast).items():
+        for steps in (steps for steps in ahead if steps <= forecast.shape[-2]):
+            scored = chosen & windows.recorded[:, steps - 1]
+            predicted = Spread(*(part[scored, steps - 1] for part in spread))
+            size = error[scored, steps - 1]
+            row = {"windows": kind, "ahead": steps, "count": int(scored.sum())}
+            for share in SHARES:
+                row[f"within_{100 * share:.0f}"] = _mean((size <= predicted.interval(share)).float().mean(-1))
+            row["half_width_90"] = _median(predicted.interval(0.9).flatten())
+            row["near_predicted"] = _mean(predicted.within(near).prod(-1))
+            row["near"] = _mean((size <= near).all(-1).float())
+            rows.append(row)
     return rows
 
 
-def swallowed_odds(spread: Spread, windows: Windows) -> list[dict[str, Any]]:
-    """Probability of being swallowed beside its share among moving targets, and its mean square error (Brier).
+def lost_probability(spread: Spread, windows: Windows, *, ahead: Sequence[int]) -> list[dict[str, Any]]:
+    """Predicted probability of being lost beside its share among moving targets, and its mean square error (Brier).
 
-    ``brier_share`` is that of always telling the share.
+    ``brier_share`` is that of predicting the share in every case.
     """
     rows = []
-    for ahead in (ahead for ahead in AHEAD if ahead <= spread.gone.shape[-1]):
-        truth = (~windows.recorded[windows.moving, ahead - 1]).float()
-        told = spread.gone[windows.moving, ahead - 1]
-        brier, share = _mean((told - truth).square()), _mean(truth)
-        spare = None if share is None else share * (1.0 - share)
-        row = {"ahead": ahead, "count": len(truth), "told": _mean(told), "share": share}
-        rows.append(row | {"brier": brier, "brier_share": spare})
+    for steps in (steps for steps in ahead if steps <= spread.gone.shape[-1]):
+        truth = (~windows.recorded[windows.moving, steps - 1]).float()
+        predicted = spread.gone[windows.moving, steps - 1]
+        share = _mean(truth)
+        row = {"ahead": steps, "count": len(truth), "predicted": _mean(predicted), "share": share}
+        row["brier"] = _mean((predicted - truth).square())
+        row["brier_share"] = None if share is None else share * (1.0 - share)
+        rows.append(row)
     return rows
 
 
-def pocket_accuracy(forecast: Tensor, windows: Windows) -> dict[str, Any]:
-    """How well a negative height at the horizon's end tells swallowed targets from the rest, among moving ones.
+def lost_accuracy(forecast: Tensor, windows: Windows, lost: Lost) -> dict[str, Any]:
+    """How well the end of the forecast tells lost targets from the rest, among moving ones.
+
+    Args:
+        forecast: ``(n, F, 3)`` [m, world].
+        windows: of n targets.
+        lost: when a forecast takes its target for lost.
 
     Returns:
-        ``count`` of windows, ``pocketed`` share of them, ``found`` share of the swallowed that are forecast so, and
-        ``false`` share of the others that are forecast swallowed; shares are None where there are none.
+        ``count`` of windows, ``lost`` share of them, ``found`` share of the lost that are forecast so, and ``false``
+        share of the others that are forecast lost; shares are None where there are none.
     """
-    sunk = forecast[windows.moving, -1, 2] < 0.0
-    truth = windows.pocketed[windows.moving]
+    forecast_lost = lost.forecast(forecast[windows.moving, -1:]).squeeze(-1)
+    truth = windows.lost[windows.moving]
     return {
         "count": len(truth),
-        "pocketed": _mean(truth.float()),
-        "found": _mean(sunk[truth].float()),
-        "false": _mean(sunk[~truth].float()),
+        "lost": _mean(truth.float()),
+        "found": _mean(forecast_lost[truth].float()),
+        "false": _mean(forecast_lost[~truth].float()),
     }
 
 
-def arrival_groups(arrival: Tensor, rest: Tensor) -> dict[str, Tensor]:
+def arrival_groups(arrival: Tensor, rest: Tensor | None = None) -> dict[str, Tensor]:
     """Masks ``(n,)`` of the samples that are scored together in any task.
 
     Args:
         arrival: ``(n,)`` control steps, negative for never.
-        rest: ``(n,)`` bool: the robot is at rest.
+        rest: ``(n,)`` bool: the robot is at rest; None if that is not scored.
     """
     soon = (arrival >= 0) & (arrival < SOON)
-    return {"all": torch.ones_like(rest), "soon": soon, "at rest": rest, "in motion": ~rest}
+    groups = {"all": torch.ones_like(soon), "soon": soon}
+    return groups if rest is None else groups | {"at rest": rest, "in motion": ~rest}
 
 
 def arrival_errors(
     logits: Tensor, arrival: Tensor, groups: Mapping[str, Tensor], *, bin_width: int = 5
 ) -> list[dict[str, Any]]:
-    """Errors of arrival times where the robot arrives within the bins, and how often *never* is told rightly.
+    """Errors of arrival times where the robot arrives within the bins, and how often *never* is predicted rightly.
 
     Args:
         logits: ``(n, bins + 1)``.
@@ -154,22 +171,22 @@ def arrival_errors(
         bin_width: control steps in a bin.
 
     Returns:
-        A row for each group and each reading of the distribution: ``samples, reading, count`` (of arrivals), ``mean``
-        and ``p95`` absolute error and ``bias`` [control steps], ``never_accuracy`` over all of the group; None where
-        nothing counts.
+        A row for each group and each estimator: ``samples, estimator, count`` (of arrivals), ``mean`` and ``p95``
+        absolute error and ``bias`` [control steps], ``never_accuracy`` over all of the group; None where nothing
+        counts.
     """
     never = (arrival < 0) | (arrival >= bin_width * (logits.shape[-1] - 1))
     rows = []
-    for reading, decode in READINGS.items():
-        read = decode(logits, bin_width=bin_width)
-        difference = read.steps - arrival
+    for estimator, decode in ESTIMATORS.items():
+        estimated = decode(logits, bin_width=bin_width)
+        difference = estimated.steps - arrival
         for name, group in groups.items():
             error = difference[group & ~never]
             size = error.abs()
-            figures = {"mean": _mean(size), "p95": _quantile(size, 0.95), "bias": _mean(error)}
-            told = _mean((read.never == never)[group].float())
-            head = {"samples": name, "reading": reading, "count": len(error)}
-            rows.append(head | figures | {"never_accuracy": told})
+            row = {"samples": name, "estimator": estimator, "count": len(error)}
+            row |= {"mean": _mean(size), "p95": _quantile(size, 0.95), "bias": _mean(error)}
+            row["never_accuracy"] = _mean((estimated.never == never)[group].float())
+            rows.append(row)
     return rows
 
 

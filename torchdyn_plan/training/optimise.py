@@ -1,4 +1,4 @@
-"""The loop that both fits share: a seeded, resumable descent with validation, checkpoints and a curve."""
+"""The loop that all fits share: a seeded, resumable descent with validation, checkpoints and a curve."""
 
 import math
 import time
@@ -117,8 +117,9 @@ class _Descent:
     ) -> None:
         self.network, self.loss, self.validate, self.recipe = network, loss, validate, recipe
         self.file, self.curve_file = out / "checkpoint.safetensors", out / "curve.json"
-        untold = ("device", "checkpoint_seconds")
-        self.settings = settings | {name: value for name, value in asdict(recipe).items() if name not in untold}
+        # A checkpoint may be continued on another device, and saved more often.
+        free = ("device", "checkpoint_seconds")
+        self.settings = settings | {name: value for name, value in asdict(recipe).items() if name not in free}
         decay = recipe.weight_decay
         self.optimiser = torch.optim.AdamW(network.parameters(), lr=recipe.lr, weight_decay=decay, fused=True)
         self.generator = torch.Generator().manual_seed(recipe.seed)

@@ -8,36 +8,75 @@ import io
 import json
 import logging
 import time
-from dataclasses import asdict
+from collections.abc import Mapping
+from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any
 
 import torch
 
-from torchdyn_plan.checks import check_number
-from torchdyn_plan.cli_arguments import TrainArguments
+from torchdyn_plan.checks import check_choice, check_number
 from torchdyn_plan.errors import InputError
 from torchdyn_plan.files import write_whole
 from torchdyn_plan.nets.policy import Actor
+from torchdyn_plan.tasks.task import Task
+from torchdyn_plan.threads import one_thread
 from torchdyn_plan.training.card import write_card
 from torchdyn_plan.training.checkpoint import group, read_checkpoint, write_checkpoint
 from torchdyn_plan.training.ddpg import DDPG
 from torchdyn_plan.training.goal_task import DDPGRecipe, GoalTask
 
 
-def train_trapper(arguments: TrainArguments) -> Path:
-    """Train Trapper's policy as the command line says; returns the weights' file."""
-    from torchdyn_plan.training.trapper_task import TrapperTask
+def train_policy(
+    task: Task,
+    name: str,
+    out: Path,
+    *,
+    lr: float | None = None,
+    options: Any = None,
+    changes: Mapping[str, Any] | None = None,
+    resume: bool = True,
+    num_threads: int = 0,
+    workers: int = 0,
+    device: str = "cpu",
+) -> Path:
+    """Train the policy ``name`` of ``task`` by its own recipe; returns the weights' file.
 
-    given: dict[str, Any] = {"iterations": arguments.steps, "batch": arguments.batch, "num_envs": arguments.num_envs}
-    if arguments.lr is not None:
-        given |= {"lr_critic": arguments.lr, "lr_actor": arguments.lr / 2}
-    recipe = DDPGRecipe(seed=arguments.seed, **{name: value for name, value in given.items() if value is not None})
-    task = TrapperTask(period=arguments.period, num_threads=arguments.threads)
+    Args:
+        task: whose policy.
+        name: one of ``task.policies``.
+        out: as for `fit_policy`.
+        lr: the critic's learning rate, the actor's in the recipe's proportion; the recipe's own for None.
+        options: an instance of the `PolicyTraining.options`; the defaults for None.
+        changes: fields of the recipe that are to be others; those that are None stay as they are.
+        resume: as for `fit_policy`, as are ``workers`` and ``device``.
+        num_threads: of the simulation, 0 for all cores.
+        workers: Ray workers.
+        device: where networks learn.
+
+    Raises:
+        InputError: there is no such policy, or its options are of another kind.
+        TrainingError: as `fit_policy` raises it.
+    """
+    check_choice(f"policy of {task.name}", name, task.policies)
+    training = task.policies[name]
+    options = training.options() if options is None else options
+    if not isinstance(options, training.options):
+        raise InputError(f"options of {name} must be {training.options.__name__}, got {type(options).__name__}")
+    recipe: DDPGRecipe = training.recipe()
+    if lr is not None:
+        recipe = recipe.with_rate(lr)
+    recipe = replace(recipe, **{field: value for field, value in (changes or {}).items() if value is not None})
     return fit_policy(
-        task, arguments.out, recipe=recipe, resume=arguments.resume, workers=arguments.workers,
-        device=arguments.device,
-    )  # fmt: skip
+        training.goal_task(options, num_threads=num_threads),
+        out,
+        name=name,
+        recipe=recipe,
+        resume=resume,
+        score_every=training.score_every,
+        workers=workers,
+        device=device,
+    )
 
 
 def fit_policy(
@@ -77,15 +116,10 @@ def fit_policy(
     check_number("score_every", score_every, minimum=1, integer=True)
     # TorchRL tells of every storage that it makes, in between the progress bar.
     logging.getLogger("torchrl").setLevel(logging.WARNING)
-    threads = torch.get_num_threads()
-    torch.set_num_threads(1)
-    try:
-        training = _Training(
-            task, out / name, recipe or DDPGRecipe(), score_every=score_every, workers=workers, device=device
-        )
+    recipe = recipe or DDPGRecipe()
+    with one_thread():
+        training = _Training(task, out / name, recipe, score_every=score_every, workers=workers, device=device)
         return training.run(resume, checkpoint_seconds)
-    finally:
-        torch.set_num_threads(threads)
 
 
 class _Training:

@@ -9,14 +9,14 @@ from typing import Protocol
 import torch
 from torch import Tensor
 
-from torchdyn_plan.envs.scene import TrapperScene
+from torchdyn_plan.checks import check_number
 
 STATES_PER_RUN = 5
 """Intermediate states taken from each run (paper, Section III-B.3)."""
 
 
-class RunningTask(Protocol):
-    """Arms that a static planner drives to goals, as `torchdyn_plan.envs.reaching.ReachingTask` does."""
+class Runner(Protocol):
+    """Robots that a static planner drives to goals; `torchdyn_plan.envs.ArmRunner` is one."""
 
     @property
     def robot_state(self) -> Tensor:
@@ -24,58 +24,64 @@ class RunningTask(Protocol):
         ...
 
     def reset(self) -> None:
-        """Put every arm at its start."""
+        """Put every robot at its start."""
         ...
 
     def is_reached(self, goal: Tensor) -> Tensor:
-        """Whether each arm is at ``goal`` (N, 3) [m, world]: ``(N,)`` bool."""
+        """Whether each robot is at ``goal`` (N, 3) [m, world]: ``(N,)`` bool."""
         ...
 
     def step(self, goal: Tensor) -> None:
-        """One control step of every arm towards ``goal`` (N, 3) [m, world]."""
+        """One control step of every robot towards ``goal`` (N, 3) [m, world]."""
         ...
 
 
 @dataclass(frozen=True, kw_only=True)
 class RunPlan:
-    """How runs follow one another; times are control steps. By default as for Trapper."""
+    """How runs follow one another; times are control steps."""
 
     goals: Callable[[int, torch.Generator], Tensor]
     """Draws so many goals, ``(count, 3)`` [m, world]."""
-    at_rest: Callable[[Tensor], Tensor]
-    """Which robot states (N, S) are at rest, ``(N,)``: an arm that comes to rest elsewhere never arrives."""
-    sequence: int = 400
+    sequence: int
     """Length of a sequence of runs, which begins at the start."""
-    longest: int = 240
+    longest: int
     """A run that has neither arrived nor come to rest by then is given up."""
-    restless: bool = False
-    """The arm never comes to rest: a run that is given up never arrives. Otherwise such a run teaches nothing."""
+    redirected_within: int
+    """A run that is redirected is so by then."""
+    at_rest: Callable[[Tensor], Tensor] | None = None
+    """Which robot states (N, S) are at rest, ``(N,)``: a robot that comes to rest elsewhere than at its goal never
+    arrives. None if states do not tell."""
+    starting: int = 0
+    """By then a new goal has set a robot in motion."""
     redirected: float = 0.35
     """Share of runs that are given another goal on their way, and teach nothing themselves."""
-    redirected_within: int = 90
-    """A run that is redirected is so by then."""
-    starting: int = 15
-    """By then a new goal has set an arm in motion."""
+    comes_to_rest: bool = True
+    """The robot comes to rest where it cannot get nearer to its goal: a run that is given up before teaches nothing.
+    Otherwise such a run never arrives."""
+
+    def __post_init__(self) -> None:
+        for name in ("sequence", "longest", "redirected_within"):
+            check_number(name, getattr(self, name), minimum=1, integer=True)
+        check_number("longest", self.longest, maximum=self.sequence)
+        check_number("starting", self.starting, minimum=0, integer=True)
+        check_number("redirected", self.redirected, minimum=0.0, maximum=1.0)
 
 
-def trapper_runs(scene: TrapperScene, *, restless: bool = False) -> RunPlan:
-    """Goals of `draw_goals`; a UR5 whose joints are slower than `AT_REST` is at rest."""
-    return RunPlan(
-        restless=restless,
-        goals=lambda count, draw: draw_goals(scene, count, draw),
-        at_rest=lambda state: (state[:, 6:12].abs() < AT_REST).all(-1),
-    )
+def record_runs(runner: Runner, plan: RunPlan, *, sequences: int, seed: int) -> dict[str, Tensor]:
+    """So many sequences of runs of every robot, one after the other; arguments and result as of `record_sequence`.
+
+    ``seed`` is of every draw.
+    """
+    draw = torch.Generator().manual_seed(seed)
+    parts = [record_sequence(runner, plan, draw) for _ in range(sequences)]
+    return {name: torch.cat([part[name] for part in parts]) for name in parts[0]}
 
 
-AT_REST = 0.05
-"""Joint speeds below this are rest [rad/s]."""
-
-
-def record_runs(task: RunningTask, plan: RunPlan, draw: torch.Generator) -> dict[str, Tensor]:
-    """One sequence of runs of every arm: a new goal when it arrives, comes to rest elsewhere, or is redirected.
+def record_sequence(runner: Runner, plan: RunPlan, draw: torch.Generator) -> dict[str, Tensor]:
+    """A sequence of runs of every robot: a new goal when it arrives, comes to rest elsewhere, or is redirected.
 
     Args:
-        task: arms driven by the static planner.
+        runner: robots driven by the static planner.
         plan: goals, and how runs follow one another.
         draw: source of goals, redirections and sampled states.
 
@@ -83,22 +89,24 @@ def record_runs(task: RunningTask, plan: RunPlan, draw: torch.Generator) -> dict
         n samples, `STATES_PER_RUN` of each run, the first at its start: ``robot_state`` (n, S), ``goal`` (n, 3)
         [m, world], ``arrival`` (n,) control steps from the state to the goal or -1 for never, ``run`` (n,) numbers.
     """
-    task.reset()
-    count, size = task.robot_state.shape
+    runner.reset()
+    count, size = runner.robot_state.shape
     states = torch.empty(plan.sequence + 1, count, size)
     goal, given = plan.goals(count, draw), torch.zeros(count, dtype=torch.int64)
     turning = _turning(plan, count, draw)
     samples: list[dict[str, Tensor]] = []
     for step in range(plan.sequence + 1):
-        states[step] = task.robot_state
+        states[step] = runner.robot_state
         age = step - given
-        arrived = task.is_reached(goal)
-        still = plan.at_rest(states[step]) & (age > plan.starting)
+        arrived = runner.is_reached(goal)
+        still = torch.zeros_like(arrived)
+        if plan.at_rest is not None:
+            still = plan.at_rest(states[step]) & (age > plan.starting)
         given_up = age >= plan.longest
         ended = arrived | still | (age >= turning) | given_up
         rows = ended.nonzero().squeeze(-1)
         if len(rows):
-            teaches = rows[(arrived | still | (given_up & plan.restless))[rows]]
+            teaches = rows[(arrived | still | (given_up & (not plan.comes_to_rest)))[rows]]
             taken = given[teaches].unsqueeze(-1) + _within(step - given[teaches], draw)
             samples.append(
                 {
@@ -110,7 +118,7 @@ def record_runs(task: RunningTask, plan: RunPlan, draw: torch.Generator) -> dict
             goal[rows], given[rows] = plan.goals(len(rows), draw), step
             turning[rows] = _turning(plan, len(rows), draw)
         # A goal's tensor belongs to the planner's memory from here on.
-        task.step(goal.clone())
+        runner.step(goal.clone())
     whole = {name: torch.cat([sample[name] for sample in samples]) for name in samples[0]}
     whole["run"] = torch.arange(len(whole["goal"])) // STATES_PER_RUN + torch.randint(2**40, (1,), generator=draw)
     return whole
@@ -127,18 +135,3 @@ def _within(length: Tensor, draw: torch.Generator) -> Tensor:
     share = torch.rand(len(length), STATES_PER_RUN, generator=draw)
     share[:, 0] = 0.0
     return (share * (length + 1).unsqueeze(-1)).long()
-
-
-def draw_goals(scene: TrapperScene, count: int, draw: torch.Generator) -> Tensor:
-    """Goals ``(count, 3)`` [m, world]: on the table and above it, near the arm, all over, and beyond the rails."""
-    kind, height = torch.rand(2, count, generator=draw)
-    flat = 2.0 * torch.rand(count, 2, generator=draw) - 1.0
-    # The arm stands behind the middle of a wall and reaches about as far as the middle of the table.
-    near = scene.half_side * torch.stack([flat[:, 0], 0.6 * flat[:, 1] - 0.4], -1)
-    place = torch.where((kind < 0.85).unsqueeze(-1), near, flat * scene.half_side)
-    place = torch.where((kind > 0.95).unsqueeze(-1), flat * 3.0, place)
-    low = scene.ball_radius + 0.005 * (2.0 * torch.rand(count, generator=draw) - 1.0)
-    high = scene.ball_radius + 0.015 + 0.25 * torch.rand(count, generator=draw)
-    sunk = -0.1 * torch.rand(count, generator=draw)
-    z = torch.where(height < 0.7, low, torch.where(height < 0.97, high, sunk))
-    return torch.cat([place, z.unsqueeze(-1)], dim=-1)

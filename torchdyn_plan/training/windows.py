@@ -23,8 +23,8 @@ class Paths(NamedTuple):
     """(E,) int64 index of each episode's position at its reset."""
     length: Tensor
     """(E,) int64 samples of each episode."""
-    pocketed: Tensor
-    """(E,) bool: the last sample is a swallowed target, which stays there for ever."""
+    lost: Tensor
+    """(E,) bool: the last sample is a lost target, which stays there for ever; ``pocketed`` in the files."""
 
 
 class Windows(NamedTuple):
@@ -35,11 +35,11 @@ class Windows(NamedTuple):
     history_length: Tensor
     """(*B,) int64 rows of the history that are no padding."""
     future: Tensor
-    """(*B, F, 3) [m, world], or on the unfolded line if that was asked for."""
+    """(*B, F, 3) [m, world], or on the unreflected line if that was asked for."""
     recorded: Tensor
-    """(*B, F) bool: false after the target was swallowed, where the future repeats its last position."""
-    pocketed: Tensor
-    """(*B,) bool: the target is swallowed within the window."""
+    """(*B, F) bool: false after the target was lost, where the future repeats its last position."""
+    lost: Tensor
+    """(*B,) bool: the target is lost within the window."""
     moving: Tensor
     """(*B,) bool: the target moves at the window's present."""
 
@@ -54,8 +54,6 @@ class WindowConfig:
     """Positions F after it."""
     first_step: int = 13
     """Earliest present: the step of the first plan."""
-    windows_per_episode: int = 5
-    """Windows drawn from an episode in an epoch, fresh ones in each."""
     early_share: float = 0.2
     """Share of windows whose present lies between ``first_step`` and H, so that their history is padded."""
     shortened_share: float = 0.2
@@ -64,7 +62,7 @@ class WindowConfig:
     """Motion below which a target counts as still [m a step]."""
 
     def __post_init__(self) -> None:
-        for name in ("history", "horizon", "windows_per_episode"):
+        for name in ("history", "horizon"):
             check_number(name, getattr(self, name), minimum=1, integer=True)
         check_number("first_step", self.first_step, minimum=0, integer=True)
         for name in ("early_share", "shortened_share"):
@@ -107,7 +105,7 @@ def last_useful_step(paths: Paths, config: WindowConfig) -> Tensor:
     index = torch.arange(len(paths.positions)) - paths.start[episode]
     moved = torch.where((step > config.still_speed) & (index > 0), index, 0)
     last_moved = torch.zeros_like(paths.length).scatter_reduce(0, episode, moved, "amax")
-    recorded = torch.where(paths.pocketed, paths.length - 2, paths.length - 1 - config.horizon)
+    recorded = torch.where(paths.lost, paths.length - 2, paths.length - 1 - config.horizon)
     return torch.minimum(recorded, last_moved + config.history)
 
 
@@ -138,7 +136,7 @@ def cut_windows(
 ) -> Windows:
     """Windows at steps ``present`` (M,) of ``episodes`` (M,), of whose history ``seen`` (M,) rows are no padding.
 
-    With ``lines`` the futures are the unfolded ones, as continued from the stretch of table that the target is on.
+    With ``lines`` the futures are the unreflected ones, as continued from the stretch of table that the target is on.
     """
     last = paths.length[episodes] - 1
     first, now = paths.start[episodes], paths.start[episodes] + present
@@ -154,5 +152,5 @@ def cut_windows(
         future = lines.track[index]
         future[..., :2] = (future[..., :2] - lines.shift[now].unsqueeze(-2)) * lines.side[now].unsqueeze(-2)
     moving = (history[..., -1, :] - history[..., -2, :]).norm(dim=-1) > config.still_speed
-    pocketed = paths.pocketed[episodes] & (last <= present + config.horizon)
-    return Windows(history, seen.clamp(max=config.history), future, recorded, pocketed, moving)
+    lost = paths.lost[episodes] & (last <= present + config.horizon)
+    return Windows(history, seen.clamp(max=config.history), future, recorded, lost, moving)

@@ -1,0 +1,149 @@
+"""Latency of a plan and of the steps around it, of this checkout and of another one, side by side in one run.
+
+    git worktree add /tmp/former 65afd9a
+    python benchmarks/former_latency.py --former /tmp/former --out latency.json
+
+Either checkout runs in a process of its own, on one thread; both are timed block by block in turn, on the same recorded
+observations at batch 1, so that whatever else the machine does hits both alike. A ratio is the median over pairs of
+blocks of this checkout's median over the other's.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import statistics
+import subprocess
+import sys
+import tempfile
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import torch
+import tyro
+from former_latency_side import CALLS
+from safetensors.torch import save_file
+from study import Output, Row, Study, each, measuring
+
+from torchdyn_plan import keys
+from torchdyn_plan.tasks import load_task
+
+HERE = Path(__file__).parent
+SEEN = (
+    keys.JOINT_POS,
+    keys.JOINT_VEL,
+    keys.TOOL_POS,
+    keys.ROBOT_STATE,
+    keys.TARGET_POS,
+    keys.TARGET_HISTORY,
+    keys.STEP_COUNT,
+)
+"""What Trapper's planners read of an observation."""
+STEPS = 20
+"""Control steps that are recorded: the first plan is made within them."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Arguments(Output):
+    """Time this checkout beside another one."""
+
+    former: Path
+    """Folder of the other checkout."""
+    planners: tuple[str, ...] = ("corner", "wait_and_drop")
+    """Trapper's planners."""
+    statics: tuple[str, ...] = ("ik", "rl")
+    """Static planners."""
+    calls: tuple[str, ...] = tuple(CALLS)
+    """What is timed."""
+    rounds: int = 20
+    """Blocks of either checkout."""
+    seconds: float = 0.1
+    """Length of a block."""
+
+
+class Checkout:
+    """A checkout in a process of its own that answers line by line."""
+
+    def __init__(self, root: Path, observations: Path) -> None:
+        """Start the package in ``root``."""
+        env = os.environ | {"PYTHONPATH": str(root), "OMP_NUM_THREADS": "1"}
+        command = [sys.executable, str(HERE / "former_latency_side.py"), str(observations)]
+        self.process = subprocess.Popen(command, env=env, text=True, stdin=subprocess.PIPE, stdout=subprocess.PIPE)
+        package = Path(self._answer())
+        if not package.is_relative_to(root):
+            raise SystemExit(f"{root} was to be timed, but Python took {package}")
+
+    def ask(self, name: str, *arguments: Any) -> Any:
+        """Call a method of its `Side`."""
+        assert self.process.stdin
+        print(json.dumps([name, arguments]), file=self.process.stdin, flush=True)
+        return self._answer()
+
+    def close(self) -> None:
+        """Let the process end."""
+        assert self.process.stdin
+        self.process.stdin.close()
+        self.process.wait()
+
+    def _answer(self) -> Any:
+        assert self.process.stdout
+        line = self.process.stdout.readline()
+        if not line:
+            raise SystemExit("a checkout's process ended; what it said stands above")
+        return json.loads(line)
+
+
+def record(file: Path) -> None:
+    """Write what is seen of one ball from the beginning of its episode, while the arm holds still, to ``file``."""
+    task = load_task("trapper")
+    env = task.make_env(task.default_settings(), num_envs=1, seed=0, split="dev", num_threads=1)
+    tensordict, seen = env.reset(), []
+    for _ in range(STEPS):
+        seen.append(tensordict.select(*SEEN))
+        tensordict.set(keys.ACTION, torch.zeros(1, env.action_spec.shape[-1]))
+        tensordict = env.step_and_maybe_reset(tensordict)[1]
+    whole: Any = torch.stack(seen)
+    save_file({key: whole[key].contiguous() for key in SEEN}, file)
+
+
+def compare(here: Checkout, there: Checkout, planner: str, static: str, arguments: Arguments) -> Iterator[Row]:
+    """A row for each call of one planner."""
+    compiled = "plan_compiled" in arguments.calls
+    prepared = [side.ask("prepare", planner, static, compiled) for side in (here, there)]
+    same = {f"same_{name}": prepared[0][name] == prepared[1][name] for name in ("plans", "actions")}
+    for call in arguments.calls:
+        blocks: list[tuple[float, float]] = []
+        for number in each(range(arguments.rounds), f"{planner}, {static}, {call}"):
+            sides = (here, there) if number % 2 == 0 else (there, here)
+            medians = {side: statistics.median(side.ask("time", call, arguments.seconds)) for side in sides}
+            blocks.append((medians[here], medians[there]))
+        yield {"planner": planner, "static": static, "call": CALLS[call], **_figures(blocks), **same}
+
+
+def _figures(blocks: list[tuple[float, float]]) -> dict[str, float]:
+    ratios = torch.tensor([here / there for here, there in blocks], dtype=torch.float64)
+    low, median, high = torch.quantile(ratios, torch.tensor([0.25, 0.5, 0.75], dtype=torch.float64)).tolist()
+    here, there = (statistics.median(values) for values in zip(*blocks, strict=True))
+    values = {"us": here, "former_us": there, "ratio": median, "ratio_quartile_1": low, "ratio_quartile_3": high}
+    return {name: round(value, 3) for name, value in values.items()}
+
+
+def main(arguments: Arguments) -> None:
+    """Time both checkouts, save and print."""
+    study = Study(arguments, scene=load_task("trapper").digest(), resume=False)
+    with tempfile.TemporaryDirectory() as folder, measuring():
+        observations = Path(folder) / "observations.safetensors"
+        record(observations)
+        here, there = (Checkout(root.resolve(), observations) for root in (HERE.parent, arguments.former))
+        for planner in arguments.planners:
+            for static in arguments.statics:
+                for row in compare(here, there, planner, static, arguments):
+                    study.add(row)
+        here.close()
+        there.close()
+
+
+if __name__ == "__main__":
+    main(tyro.cli(Arguments))

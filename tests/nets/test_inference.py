@@ -1,0 +1,132 @@
+import pytest
+import torch
+
+from torchdyn_plan.errors import InputError
+from torchdyn_plan.nets import ETANetwork, Forecaster, SpreadForecaster, SpreadNetwork
+from torchdyn_plan.nets.symmetry import square_symmetries
+
+FORECASTERS = [
+    {"square_symmetry": True, "half_extent": 0.7},
+    {"square_symmetry": False, "half_extent": 0.7},
+    {"square_symmetry": True},
+    {"channels": 40, "convolutions": 2},
+    {"history": 12, "convolutions": 4},
+    {"history": 6},
+]
+
+
+def forecaster(**settings):
+    torch.manual_seed(0)
+    network = Forecaster(**{"horizon": 20, "hidden": 16, "channels": 8, **settings}).double()
+    for parameter in network.parameters():
+        torch.nn.init.normal_(parameter, std=0.3)
+    return network.eval().requires_grad_(False)
+
+
+def arrivals():
+    torch.manual_seed(0)
+    network = ETANetwork(hidden=16).double().eval().requires_grad_(False)
+    state, goal, _ = samples(300)
+    network.set_input_statistics(3 * state + 1, 2 * goal - 1)
+    return network
+
+
+def samples(*batch):
+    draw = torch.Generator().manual_seed(0)
+    return [torch.rand(*batch, size, generator=draw, dtype=torch.float64) for size in (15, 3, 3)]
+
+
+def histories(count, length=24):
+    draw = torch.Generator().manual_seed(0)
+    start, step = torch.rand(2, count, 1, 3, generator=draw, dtype=torch.float64) - 0.5
+    ahead = torch.arange(length, dtype=torch.float64).clamp_min(length // 2).unsqueeze(-1)
+    noise = 1e-4 * torch.rand(count, length, 3, generator=draw, dtype=torch.float64)
+    history = start + 0.02 * step * ahead + noise
+    history[:, : length // 2] = history[:, length // 2 : length // 2 + 1]
+    history[0] = history[0, :1]
+    return history
+
+
+@pytest.mark.parametrize("settings", FORECASTERS)
+def test_a_forecaster_for_inference_forecasts_the_same(settings):
+    network = forecaster(**settings)
+    history = histories(60, network.config.history)
+    forecast = network.for_inference()(history.view(5, 12, *history.shape[1:])).flatten(0, 1)
+    torch.testing.assert_close(forecast, network(history), atol=1e-11, rtol=1e-11)
+    assert forecast.std() > 0.1
+
+
+@pytest.mark.parametrize("settings", [setting for setting in FORECASTERS if setting.get("half_extent")])
+def test_a_forecaster_for_inference_is_described_the_same(settings):
+    network = forecaster(**settings)
+    history = histories(60, network.config.history)
+    found = network.for_inference().describe(history.view(5, 12, *history.shape[1:]))
+    for one, other in zip(found, network.describe(history), strict=True):
+        torch.testing.assert_close(one.flatten(0, 1), other, atol=1e-11, rtol=1e-11)
+    assert found[2].any() == bool(settings.get("square_symmetry"))
+    assert not found[2].all()
+
+
+def test_a_spread_is_the_same_beside_a_forecaster_for_inference():
+    network = forecaster(**FORECASTERS[0])
+    spread = SpreadNetwork(features=16, horizon=20, hidden=8, rank=4).double().eval()
+    torch.nn.init.normal_(spread.head.weight)
+    whole, history = SpreadForecaster(network, spread), histories(60)
+    found, expected = whole.for_inference().predict(history), whole.predict(history)
+    torch.testing.assert_close(found.path, expected.path, atol=1e-11, rtol=1e-11)
+    for one, other in zip(found.spread, expected.spread, strict=True):
+        torch.testing.assert_close(one, other)
+    assert whole.for_inference().history == whole.history == 24
+
+
+def test_forecasts_for_inference_turn_exactly_with_their_histories():
+    network, history = forecaster(**FORECASTERS[0]).for_inference(), histories(60)[1:]
+    for symmetry in square_symmetries().double():
+        assert torch.equal(network(history @ symmetry), network(history) @ symmetry)
+
+
+@pytest.mark.parametrize("estimator", ["mode", "expectation", "distribution", "soft"])
+def test_an_eta_for_inference_gives_the_same_arrivals(estimator):
+    network, (state, goal, _) = arrivals(), samples(6, 5)
+    fast = network.for_inference()
+    torch.testing.assert_close(fast(state, goal), network(state, goal), atol=1e-12, rtol=1e-12)
+    expected = network.arrival(state[:, :1], goal, estimator=estimator)
+    ask = fast.from_state(state[:, 0])
+    for found in (fast.arrival(state[:, :1], goal, estimator=estimator), ask(goal, estimator=estimator)):
+        torch.testing.assert_close(found.steps, expected.steps)
+        torch.testing.assert_close(found.never, expected.never)
+        torch.testing.assert_close(found.bins, expected.bins)
+        assert found.bin_width == expected.bin_width
+
+
+def test_a_network_for_inference_is_a_copy_that_holds_and_saves_no_weights():
+    for network, inputs in ((forecaster(), [histories(2)]), (arrivals(), samples(2)[:2])):
+        fast = network.for_inference()
+        before = fast(*inputs).clone()
+        with torch.no_grad():
+            network.head.bias.add_(1.0)
+        assert torch.equal(fast(*inputs), before)
+        assert not torch.allclose(network.for_inference()(*inputs), before)
+        assert not [*fast.parameters(), *fast.state_dict()]
+        with pytest.raises(RuntimeError, match="Unexpected key"):
+            fast.load_state_dict(network.state_dict())
+
+
+def test_a_network_for_inference_follows_dtype():
+    assert forecaster().float().for_inference()(histories(2).float()).dtype == torch.float32
+    assert arrivals().for_inference().float()(*(x.float() for x in samples(2)[:2])).dtype == torch.float32
+
+
+def test_wrong_inputs_are_named():
+    network, fast = forecaster().for_inference(), arrivals().for_inference()
+    state, goal, _ = samples(2)
+    with pytest.raises(InputError, match=r"target_history.*24, 3.*\(2, 23, 3\)"):
+        network(torch.zeros(2, 23, 3))
+    with pytest.raises(InputError, match="target_history must be finite"):
+        network(histories(2) * float("nan"))
+    with pytest.raises(InputError, match=r"robot_state.*15.*\(2, 14\)"):
+        fast(state[:, :14], goal)
+    with pytest.raises(InputError, match="goal must be finite"):
+        fast(state, goal * float("inf"))
+    with pytest.raises(InputError, match="expectation"):
+        fast.arrival(state, goal, estimator="expectaton")

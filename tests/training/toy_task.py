@@ -1,0 +1,73 @@
+"""A task whose recorders count what they are asked for, and whose policy learns in seconds."""
+
+from dataclasses import dataclass
+
+import torch
+
+from tests.envs.points import STRIDE, PointEnv
+from tests.training.points import PointTask
+from torchdyn_plan.nets import Actor, ETAConfig, ForecasterConfig, PolicyConfig
+from torchdyn_plan.planners import PolicyPlanner, ProportionalController
+from torchdyn_plan.tasks import PolicyTraining, Settings, Task, Words
+from torchdyn_plan.training import DDPGRecipe, Fitting, lay_end_to_end
+
+SIZES = PolicyConfig(robot_state_size=3, tool_slice=(0, 3), action_size=3, hidden=8, layers=1)
+
+
+@dataclass(frozen=True, kw_only=True)
+class LearnOptions:
+    """Of the policy."""
+
+    note: str = "none"
+    """Something to say."""
+
+
+def record_paths(blocks, *, seed, num_threads):
+    draws = [
+        torch.rand(len(block), 3, generator=torch.Generator().manual_seed(seed + int(block[0]))) for block in blocks
+    ]
+    start = torch.cat(draws)
+    path = start.unsqueeze(1) + 0.01 * torch.arange(40.0).view(-1, 1) * torch.tensor([1.0, 0.0, 0.0])
+    return lay_end_to_end(path, start[:, 0])
+
+
+def record_arrivals(planner, *, num_envs, sequences, seed, num_threads):
+    draw = torch.Generator().manual_seed(seed)
+    goal = torch.rand(num_envs * sequences, 3, generator=draw)
+    arrival = (goal.abs().amax(-1) / STRIDE).ceil().long()
+    state = torch.zeros_like(goal) if isinstance(planner, ProportionalController) else torch.ones_like(goal)
+    return {"robot_state": state, "goal": goal, "arrival": arrival, "run": torch.arange(len(goal)) // 2}
+
+
+def learned(*, chunk=None, weights=None):
+    return PolicyPlanner(Actor.from_pretrained(weights) if weights else Actor(SIZES), chunk=chunk)
+
+
+TASK = Task(
+    name="toy",
+    summary="Points meet points.",
+    settings=Settings,
+    words=Words(success="met", steps="steps to meet"),
+    max_steps=40,
+    control_step=0.1,
+    make_env=lambda settings, num_threads, **series: PointEnv(**series),
+    digest=lambda: "toy-1",
+    static_planners={"straight": lambda chunk, weights: ProportionalController(gain=1.0 / STRIDE), "learned": learned},
+    planners={},
+    record_paths=record_paths,
+    record_arrivals=record_arrivals,
+    fitting=lambda: Fitting(
+        forecaster=ForecasterConfig(history=4, horizon=10, channels=4, convolutions=1, hidden=8, rank=4),
+        eta=ETAConfig(robot_state_size=3, tool_slice=(0, 3), bins=12, bin_width=1, hidden=8),
+        spread=True,
+    ),
+    policies={
+        "policy": PolicyTraining(
+            summary="Learns to reach.",
+            options=LearnOptions,
+            goal_task=lambda options, num_threads: PointTask(),
+            recipe=lambda: DDPGRecipe(iterations=2, num_envs=4, updates=2, batch=16, capacity=200, warmup=1, gamma=0.9),
+            score_every=1,
+        )
+    },
+)

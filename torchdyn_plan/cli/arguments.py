@@ -1,0 +1,150 @@
+"""What each command takes; `torchdyn_plan.cli.forms` adds what a task has to choose from.
+
+Types alone are settled here: values are checked by what they are handed to, so that Python and the command line say the
+same.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from torchdyn_plan.tasks import DEFAULT
+
+BENCHMARKS = {
+    "replan": "torchdyn_plan.bench.replan",
+    "env": "torchdyn_plan.bench.env",
+    "kinematics": "torchdyn_plan.bench.kinematics",
+}
+"""Name of each benchmark, and the module whose ``bench()`` returns its rows and whose ``plot``, if any, draws them."""
+
+DATA = Path("runs/data")
+"""Folder of collected data, if no other is named."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Arguments:
+    """What every command takes; its task is read from the words before anything else."""
+
+    task: str = DEFAULT
+
+
+@dataclass(frozen=True, kw_only=True)
+class EpisodeArguments(Arguments):
+    """Which episodes are run, and by which planners."""
+
+    planners: tuple[str, ...] = ()
+    static: str = ""
+    settings: Any = None
+    weights: Path | None = None
+    """Folder of the planners' networks, as train leaves it; those that ship when not given."""
+    episodes: int = 100
+    """Number of episodes for each planner, always episodes 0 to N-1; of a sweep for each value and repeat."""
+    seed: int = 0
+    """Which series of episodes; of a sweep the first one."""
+    split: str = "test"
+    """Which family of series: test, or dev for tuning."""
+    num_envs: int = 64
+    """Episodes that run side by side; does not change the results."""
+    threads: int = 0
+    """Threads of the simulation, 0 for all cores; does not change the results."""
+    latency_ms: float = 0.0
+    """Time by which every plan comes late, whole control steps; planners that make no plans have none."""
+    compensate: bool = True
+    """Tell the planners of that time, so that they plan for the moment when the plan is there."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class EvaluateArguments(EpisodeArguments):
+    """Run episodes at one setting with each planner; print a table and write the results."""
+
+    out: Path | None = None
+    """Folder for results.json, episodes.json and the plot; nothing is written without it."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class SweepArguments(EpisodeArguments):
+    """Evaluate along the values of one setting; a killed sweep continues."""
+
+    over: str
+    out: Path
+    """Folder of the sweep: its points, results.json and the plot. One that holds points already is continued."""
+    values: tuple[float, ...] = ()
+    """Values of the setting; the paper's when none are given, or the task's."""
+    repeats: int = 10
+    """Series of episodes for each value, with seeds upwards from the first."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class CollectArguments(Arguments):
+    """Gather training data: paths of targets nobody touches, or arrival times of a static planner."""
+
+    what: str
+    static: str = ""
+    out: Path = DATA
+    """Folder for the shards of data."""
+    weights: Path | None = None
+    """Of a static planner that is a policy: a file, or a folder of its training; the one that ships when not given."""
+    episodes: int = 20000
+    """Number of targets, or of sequences of runs of the static planner."""
+    seed: int = 0
+    """Which series of episodes."""
+    num_envs: int = 256
+    """Episodes that run side by side."""
+    threads: int = 0
+    """Threads of the simulation, 0 for all cores."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class TrainArguments(Arguments):
+    """Train a network, on collected data or by trial; a killed run continues where its folder stands."""
+
+    out: Path = Path("runs/training")
+    """Folder for checkpoints, the curve and the weights, one for each network."""
+    steps: int | None = None
+    """Optimiser steps; the recipe's own when not given."""
+    batch: int | None = None
+    """Samples a step; the recipe's own when not given."""
+    lr: float | None = None
+    """Highest learning rate; the recipe's own when not given."""
+    seed: int = 0
+    """Seed of initialisation and sampling."""
+    device: str = "cpu"
+    """Where to train: cpu, cuda, cuda:1, …"""
+    resume: bool = True
+    """Continue from the checkpoint in the folder, if there is one."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class FitArguments(TrainArguments):
+    """Fit a network to collected data."""
+
+    data: Path = DATA
+    """Folder of the collected shards."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class PolicyArguments(TrainArguments):
+    """Train a policy by trial."""
+
+    steps: int | None = None
+    """Rounds of episodes and updates; the recipe's own when not given."""
+    num_envs: int | None = None
+    """Episodes that run side by side; the recipe's own when not given."""
+    threads: int = 0
+    """Threads of the simulation, 0 for all cores; does not change the result."""
+    workers: int = 0
+    """Ray workers that run the episodes, 0 to run them in this process."""
+    training: Any = None
+
+
+@dataclass(frozen=True, kw_only=True)
+class BenchArguments(Arguments):
+    """Measure speed on this machine."""
+
+    name: str
+    out: Path | None = None
+    """JSON file for the figures; a plot, where there is one, is put beside it."""
+    compiled: bool = True
+    """Measure compiled forms too, where there are any: they take minutes to compile."""

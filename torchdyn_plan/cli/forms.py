@@ -1,0 +1,152 @@
+"""Arguments made for a task, from which the parser makes options. Nothing heavy is imported: help answers at once."""
+
+from __future__ import annotations
+
+import dataclasses
+import typing
+from collections.abc import Iterable, Sequence
+from typing import Any
+
+from torchdyn_plan.cli.arguments import (
+    BENCHMARKS,
+    Arguments,
+    BenchArguments,
+    CollectArguments,
+    EpisodeArguments,
+    EvaluateArguments,
+    FitArguments,
+    PolicyArguments,
+    SweepArguments,
+)
+from torchdyn_plan.errors import InputError
+from torchdyn_plan.tasks import DEFAULT, Task, task_names
+
+FITTED = {
+    "forecaster": "Fit the forecaster to paths of the target.",
+    "spread": "Fit how far the forecaster is off, to paths of the target.",
+    "eta": "Fit the network of arrival times to runs of a static planner.",
+}
+"""Networks that are fitted to data, and what ``--help`` says of them."""
+
+
+def task_of(words: Sequence[str]) -> tuple[str, list[str]]:
+    """The task that ``--task NAME`` or ``--task=NAME`` names, the last of several, and the other words."""
+    name, others, rest = DEFAULT, [], iter(words)
+    for word in rest:
+        if word == "--task":
+            name = next(rest, "")
+        elif word.startswith("--task="):
+            name = word.removeprefix("--task=")
+        else:
+            others.append(word)
+            continue
+        if not name or name.startswith("-"):
+            raise InputError(f"--task names none; choose from {', '.join(task_names())}, or give package.module:NAME")
+    return name, others
+
+
+def command_forms(task: Task, named: str) -> dict[str, type[Arguments]]:
+    """The arguments of each command but ``train`` for ``task``, which the words call ``named``."""
+    return {
+        "evaluate": _episode_form(EvaluateArguments, task, named),
+        "sweep": _episode_form(SweepArguments, task, named, over=_over(task)),
+        "collect": _form(
+            CollectArguments,
+            task=_task_option(named),
+            what=_option(str, "Which data.", choices=("paths", "arrivals"), positional=True),
+            static=_static_option(task, "Static planner whose arrivals are measured."),
+        ),
+        "bench": _form(
+            BenchArguments,
+            task=_task_option(named),
+            name=_option(str, "What to measure.", choices=BENCHMARKS, positional=True),
+        ),
+    }
+
+
+def train_forms(task: Task, named: str) -> dict[str, type[Arguments]]:
+    """The arguments of training each network of ``task``, which the words call ``named``."""
+    from torchdyn_plan.training.train import networks
+
+    fitted = [network for network in networks(task) if network not in task.policies]
+    forms = {network: _form(FitArguments, FITTED[network], task=_task_option(named)) for network in fitted}
+    for name, training in task.policies.items():
+        options = _group(_plain(training.options))
+        forms[name] = _form(PolicyArguments, training.summary, task=_task_option(named), training=options)
+    return forms
+
+
+def _episode_form(base: type[EpisodeArguments], task: Task, named: str, **own: Any) -> type[EpisodeArguments]:
+    planners = _option(
+        tuple[str, ...], "Planners for the moving target.", choices=task.planners, default=task.default_planners
+    )
+    return _form(
+        base,
+        task=_task_option(named),
+        planners=planners,
+        static=_static_option(task, "Static planner that drives the robot."),
+        settings=_group(_settings_form(task)),
+        **own,
+    )
+
+
+def _settings_form(task: Task) -> type[Any]:
+    """The task's settings as bare values, without their checks."""
+    kinds = typing.get_type_hints(task.settings)
+    fields = {}
+    for one in dataclasses.fields(task.settings):
+        about = one.metadata
+        unit = f" [{about['unit']}]" if about.get("unit") else ""
+        text = f"{about.get('text', one.name)}{unit}."
+        fields[one.name] = _option(kinds[one.name], text, choices=about.get("choices", ()), default=one.default)
+    return _form(None, f"Settings of {task.name}.", **fields)
+
+
+def _over(task: Task) -> Any:
+    names = [one.name for one in dataclasses.fields(task.settings) if one.metadata.get("sweep")]
+    return _option(str, "What varies.", choices=names)
+
+
+def _static_option(task: Task, text: str) -> Any:
+    return _option(str, text, choices=task.static_planners, default=task.default_static)
+
+
+def _task_option(named: str) -> Any:
+    text = f"Task: {', '.join(task_names())}, or package.module:NAME. It decides what there is to choose from."
+    return _option(str, text, default=named)
+
+
+def _option(
+    kind: Any, text: str, *, choices: Iterable[Any] = (), default: Any = dataclasses.MISSING, positional: bool = False
+) -> tuple[Any, Any]:
+    """Type and field of an option, with what ``--help`` says of it."""
+    import tyro
+
+    shown = "{" + ",".join(map(str, choices)) + "}" if choices else None
+    if shown and kind == tuple[str, ...]:
+        shown = f"[{shown} ...]"
+    marks: list[Any] = [tyro.conf.arg(help=text, metavar=shown)]
+    if positional:
+        marks.append(tyro.conf.Positional)
+    return typing.Annotated[(kind, *marks)], dataclasses.field(default=default)
+
+
+def _group(kind: type[Any]) -> tuple[Any, Any]:
+    """Type and field of the options that the dataclass ``kind`` has, without a prefix."""
+    import tyro
+
+    return typing.Annotated[kind, tyro.conf.OmitArgPrefixes], dataclasses.field(default_factory=kind)
+
+
+def _form(base: type[Any] | None, summary: str = "", **options: tuple[Any, Any]) -> type[Any]:
+    """A dataclass like ``base`` with some fields replaced by ``options``, or added."""
+    fields = [(name, kind, own) for name, (kind, own) in options.items()]
+    bases = () if base is None else (base,)
+    made = dataclasses.make_dataclass("Form", fields, bases=bases, frozen=True, kw_only=True)
+    made.__doc__ = summary or (base.__doc__ if base else "")
+    return made
+
+
+def _plain(options: type[Any]) -> type[Any]:
+    """The dataclass ``options`` without its checks: a parser would take their errors for its own."""
+    return type(options.__name__, (options,), {"__post_init__": lambda self: None, "__doc__": options.__doc__})

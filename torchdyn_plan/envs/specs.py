@@ -1,0 +1,40 @@
+"""What environments declare of their entries, in TorchRL's terms."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import torch
+from torchrl.data import Binary, Composite, Unbounded
+
+from torchdyn_plan import keys
+
+
+def flag_spec(num_envs: int) -> Binary:
+    """Of a bool ``(N, 1)``."""
+    return Binary(shape=torch.Size((num_envs, 1)), dtype=torch.bool)
+
+
+def observation_spec(
+    num_envs: int, *, joints: int, state_size: int, history: int, flags: tuple[str, ...], static_target: bool
+) -> Composite:
+    """What is observed in ``num_envs`` environments; arguments as of `torchdyn_plan.envs.MovingTargetEnv`."""
+    vectors: dict[str, tuple[int, ...]] = {
+        keys.TOOL_POS: (3,),
+        keys.TARGET_POS: (3,),
+        keys.TARGET_HISTORY: (history, 3),
+        keys.ROBOT_STATE: (state_size,),
+        keys.OBSERVATION: (state_size,),
+        keys.ACHIEVED_GOAL: (3,),
+        keys.DESIRED_GOAL: (3,),
+    }
+    if joints:
+        vectors |= {keys.JOINT_POS: (joints,), keys.JOINT_VEL: (joints,)}
+    if static_target:
+        vectors[keys.GOAL] = (3,)
+    specs: dict[str, Any] = {key: Unbounded(torch.Size((num_envs, *shape))) for key, shape in vectors.items()}
+    for key in (keys.HISTORY_LENGTH, keys.STEP_COUNT, keys.EPISODE):
+        specs[key] = Unbounded(torch.Size((num_envs,)), dtype=torch.int64)
+    for key in flags:
+        specs[key] = flag_spec(num_envs)
+    return Composite(specs, shape=(num_envs,))

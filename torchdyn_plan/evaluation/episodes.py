@@ -1,0 +1,214 @@
+"""The one loop of an evaluation, whatever the task: environment, planner, and a log of what happens."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from typing import Any
+
+import torch
+from tensordict import TensorDictBase
+from torch import Tensor
+
+from torchdyn_plan import keys
+from torchdyn_plan.envs.moving_target import MovingTargetEnv
+from torchdyn_plan.evaluation.results import NO_CAUSE, EpisodeOutcomes
+from torchdyn_plan.evaluation.traces import Trace, TraceLog
+from torchdyn_plan.tasks.task import Task, Truth, Verdict
+
+Planner = Callable[[TensorDictBase], TensorDictBase]
+"""Anything that writes ``action`` into a tensordict of observations, and returns it. One that reads the recorded truth
+says so: ``target_future`` is among its ``in_keys``."""
+
+
+@dataclass(kw_only=True)
+class EpisodeLog:
+    """What has happened in each of E episodes so far; every tensor is ``(E,)``."""
+
+    success_flag: str
+    """Flag of the environment that tells success."""
+    done: Tensor
+    """Which episodes have ended, bool."""
+    steps: Tensor
+    """First control step at which the success flag was true, int64; -1 for none."""
+    replans: Tensor
+    """How often the planner planned, int64, of episodes that have ended."""
+    flags: dict[str, Tensor]
+    """The environment's other flags when the episode ended, bool, by name."""
+    traces: TraceLog | None
+    """Step by step, all that was seen and planned; None if nobody asks for it."""
+    order: list[Tensor]
+    """Numbers of the episodes in the order in which they ended."""
+
+    @classmethod
+    def empty(cls, count: int, task: Task, env: MovingTargetEnv) -> EpisodeLog:
+        """The log of ``count`` episodes of ``task`` to come in ``env``; with traces if the task judges by them."""
+        no = torch.zeros(count, dtype=torch.bool)
+        others = [flag for flag in env.flags if flag != task.words.success]
+        return cls(
+            success_flag=task.words.success,
+            done=no,
+            steps=torch.full((count,), -1),
+            replans=torch.zeros(count, dtype=torch.int64),
+            flags={flag: no.clone() for flag in others},
+            traces=None if task.judge is None else TraceLog(env.max_steps),
+            order=[],
+        )
+
+    @property
+    def success(self) -> Tensor:
+        """Which episodes have been a success, bool."""
+        return self.steps >= 0
+
+    def add(self, stepped: TensorDictBase) -> int:
+        """Take in one step of all environments; returns how many episodes it ended. What comes later does not count."""
+        if self.traces is not None:
+            self.traces.add(stepped)
+        after: TensorDictBase = stepped.get("next")
+        done, success = after["done"].squeeze(-1), after[self.success_flag].squeeze(-1)
+        noted = done | success
+        if not noted.any():
+            return 0
+        episode = after[keys.EPISODE]
+        counts = episode < len(self.done)
+        counts[counts.clone()] = ~self.done[episode[counts]]
+        rows = (noted & counts).nonzero().squeeze(-1)
+        first = rows[success[rows] & (self.steps[episode[rows]] < 0)]
+        self.steps[episode[first]] = after[keys.STEP_COUNT][first]
+        ended = rows[done[rows]]
+        if len(ended):
+            self._end(stepped, ended)
+        return len(ended)
+
+    def _end(self, stepped: TensorDictBase, rows: Tensor) -> None:
+        """Close the episodes of environments ``rows`` (R,), which end with this step."""
+        after: TensorDictBase = stepped.get("next")
+        episode = after[keys.EPISODE][rows]
+        self.done[episode] = True
+        for name, flag in self.flags.items():
+            flag[episode] = after[name].squeeze(-1)[rows]
+        replans = stepped.get((keys.PLAN, "replans"), None)
+        self.replans[episode] = 0 if replans is None else replans[rows]
+        if self.traces is not None:
+            self.traces.end(stepped, rows)
+        self.order.append(episode)
+
+    def records(self) -> Iterator[tuple[Tensor, Trace]]:
+        """Records of all episodes that have ended, some at a time: their numbers ``(R,)`` and their `Trace`."""
+        begin = 0
+        for trace in [] if self.traces is None else self.traces.traces():
+            count = len(trace.length)
+            yield torch.cat(self.order)[begin : begin + count], trace
+            begin += count
+
+
+def play(planner: Planner, env: MovingTargetEnv, log: EpisodeLog, future: Tensor | None = None) -> Iterator[int]:
+    """Step all environments once for each value taken, which is the number of ``log``'s episodes that the step ended.
+
+    ``future`` (E, T, 3) is the recorded truth for planners that read ``target_future``; None or T = 0 for none.
+    """
+    shown = future if keys.TARGET_FUTURE in getattr(planner, "in_keys", ()) else None
+    if shown is not None and not shown.shape[1]:
+        shown = None
+    tensordict = env.reset()
+    while True:
+        if shown is not None:
+            tensordict[keys.TARGET_FUTURE] = shown[tensordict[keys.EPISODE].clamp(max=len(shown) - 1)]
+        stepped, tensordict = env.step_and_maybe_reset(planner(tensordict))
+        yield log.add(stepped)
+
+
+def play_all(
+    planner: Planner, env: MovingTargetEnv, log: EpisodeLog, future: Tensor | None, *, name: str, progress: bool = True
+) -> float:
+    """Play until all of ``log``'s episodes have ended; an environment takes the next episode when its own ends.
+
+    Args:
+        planner: any planner for a moving target.
+        env: what it acts in, at its first episode.
+        log: of the episodes to come.
+        future: ``(E, T, 3)`` recorded truth, as `play` says.
+        name: shown beside the progress bar.
+        progress: show the bar.
+
+    Returns:
+        How long it took [s].
+    """
+    from tqdm import tqdm
+
+    count, started, ended = len(log.done), time.perf_counter(), 0
+    with torch.no_grad(), tqdm(total=count, desc=name, unit="episode", leave=False, disable=not progress) as bar:
+        for more in play(planner, env, log, future):
+            bar.update(more)
+            ended += more
+            if ended >= count:
+                break
+    return time.perf_counter() - started
+
+
+def find_truth(
+    task: Task, settings: Any, *, episodes: int, seed: int, split: str, static: str | None = None, num_threads: int = 0
+) -> Truth:
+    """What is known of episodes 0 … E-1 before anybody plays them, with the static planner of that name.
+
+    Of a task that knows nothing beforehand all episodes count as solvable, and their future has T = 0 steps.
+    """
+    if task.truth is None:
+        return Truth(torch.empty(episodes, 0, 3), torch.ones(episodes, dtype=torch.bool))
+    name = static or task.default_static
+    return task.truth(settings, episodes=episodes, seed=seed, split=split, static=name, num_threads=num_threads)
+
+
+def run_episodes(
+    planner: Planner,
+    task: Task,
+    settings: Any,
+    truth: Truth,
+    *,
+    episodes: int,
+    seed: int = 0,
+    split: str = "test",
+    num_envs: int = 64,
+    num_threads: int = 0,
+    name: str = "",
+    progress: bool = True,
+) -> EpisodeOutcomes:
+    """Outcomes of episodes 0 … E-1 under ``planner``.
+
+    Args:
+        planner: any planner for a moving target.
+        task: whose environment it acts in.
+        settings: the task's.
+        truth: of these episodes, as of `find_truth`.
+        episodes: their number E.
+        seed: which series of episodes.
+        split: which family of series.
+        num_envs: episodes that run side by side; does not change the outcomes.
+        num_threads: of the simulation, 0 for all cores; does not change the outcomes.
+        name: shown beside the progress bar.
+        progress: show the bar.
+    """
+    side_by_side = min(num_envs, episodes)
+    env = task.make_env(settings, num_envs=side_by_side, seed=seed, split=split, num_threads=num_threads)
+    log = EpisodeLog.empty(episodes, task, env)
+    seconds = play_all(planner, env, log, truth.future, name=name, progress=progress)
+    verdict = _judge(task, settings, log, truth)
+    return EpisodeOutcomes(
+        success=log.success,
+        steps=log.steps,
+        replans=log.replans,
+        solvable=truth.solvable,
+        flags=log.flags | dict(verdict.flags),
+        evidence=verdict.evidence,
+        cause=verdict.cause,
+        causes=task.causes,
+        seconds=seconds,
+    )
+
+
+def _judge(task: Task, settings: Any, log: EpisodeLog, truth: Truth) -> Verdict:
+    """The task's verdict; of a task that gives none, that no episode has a cause."""
+    if task.judge is None:
+        return Verdict(torch.full((len(log.done),), NO_CAUSE), {}, {})
+    return task.judge(settings, log, truth)

@@ -1,0 +1,134 @@
+"""Planners, and the episodes that all of them are to play: what an evaluation and a sweep have in common."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from torchdyn_plan.checks import check_choice, check_number
+from torchdyn_plan.errors import InputError
+from torchdyn_plan.evaluation.episodes import Planner, find_truth, run_episodes
+from torchdyn_plan.evaluation.results import EpisodeOutcomes, ResultRow, summarize
+from torchdyn_plan.planners import Delivery, DynamicPlanner
+from torchdyn_plan.tasks.task import Settings, Task
+from torchdyn_plan.threads import one_thread
+
+SPLITS = ("test", "dev")
+"""Families of series of episodes to evaluate on: tuning sees ``dev`` only."""
+
+Planners = Mapping[str, Planner] | Sequence[str]
+"""Planners by name, or names of a task's own."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Study:
+    """Planners by name, and how many episodes of which kind each of them plays."""
+
+    task: Task
+    planners: Mapping[str, Planner]
+    static: str
+    """Name of the static planner that decides which episodes are solvable."""
+    episodes: int = 100
+    split: str = "test"
+    num_envs: int = 64
+    num_threads: int = 0
+    delivery: Delivery | None = None
+    progress: bool = True
+
+    def __post_init__(self) -> None:
+        check_number("episodes", self.episodes, minimum=1, integer=True)
+        check_number("num_envs", self.num_envs, minimum=1, integer=True)
+        check_number("num_threads", self.num_threads, minimum=0, integer=True)
+        check_choice("split", self.split, SPLITS)
+
+    @classmethod
+    def of(
+        cls,
+        task: Task,
+        planners: Planners | None = None,
+        *,
+        static: str | None = None,
+        weights: str | Path | None = None,
+        delivery: Delivery | None = None,
+        other_scene: bool = False,
+        **episodes: Any,
+    ) -> Study:
+        """The study of ``planners``, as `evaluate` says; ``episodes`` are the other fields."""
+        static = static or task.default_static
+        check_choice(f"static planner of {task.name}", static, task.static_planners)
+        # Fields are checked before weights are loaded.
+        study = cls(task=task, planners={}, static=static, delivery=delivery, **episodes)
+        if not isinstance(planners, Mapping):
+            made = _make(task, planners, static, weights)
+        elif weights is None:
+            made = dict(planners)
+        else:
+            raise InputError("weights are of planners that are named, but the planners were given themselves")
+        if not made:
+            raise InputError(f"planners must name at least one of {', '.join(task.planners)}")
+        if not other_scene:
+            _check_scenes(task, made)
+        if delivery is not None:
+            made = {name: _delivered(planner, delivery) for name, planner in made.items()}
+        return dataclasses.replace(study, planners=made)
+
+    def run(self, settings: Settings, seed: int) -> dict[str, EpisodeOutcomes]:
+        """Outcomes of the same episodes for each planner."""
+        shared: dict[str, Any] = {
+            "episodes": self.episodes,
+            "seed": seed,
+            "split": self.split,
+            "num_threads": self.num_threads,
+        }
+        with one_thread():
+            truth = find_truth(self.task, settings, static=self.static, **shared)
+            shared |= {"num_envs": self.num_envs, "progress": self.progress}
+            return {
+                name: run_episodes(planner, self.task, settings, truth, name=name, **shared)
+                for name, planner in self.planners.items()
+            }
+
+    def summarize(self, settings: Settings, outcomes: Mapping[str, EpisodeOutcomes]) -> list[ResultRow]:
+        """A row for each planner."""
+        shared: dict[str, Any] = {"task": self.task, "static": self.static, "settings": settings}
+        return [summarize(outcome, planner=name, **shared) for name, outcome in outcomes.items()]
+
+    def config(self) -> dict[str, Any]:
+        """What was run, for a file of results."""
+        counts = {name: getattr(self, name) for name in ("episodes", "split", "num_envs", "num_threads")}
+        delivery = None if self.delivery is None else repr(self.delivery)
+        about = {"task": self.task.name, "planners": list(self.planners), "static": self.static}
+        return about | counts | {"delivery": delivery, "scene": self.task.digest()}
+
+
+def _make(task: Task, names: Sequence[str] | None, static: str, weights: str | Path | None) -> dict[str, Planner]:
+    """The task's planners of these names, its default ones for None."""
+    names = task.default_planners if names is None else (names,) if isinstance(names, str) else names
+    for name in names:
+        check_choice(f"planner of {task.name}", name, task.planners)
+    if len(set(names)) < len(names):
+        raise InputError(f"planners must be named once each, got {' '.join(names)}")
+    chunk, static_chunk = task.rows_at_once
+    sizes: dict[str, Any] = {"chunk": chunk, "static_chunk": static_chunk}
+    with one_thread():
+        return {name: task.planner(name, static, weights=weights, **sizes) for name in names}
+
+
+def _check_scenes(task: Task, planners: Mapping[str, Planner]) -> None:
+    """Raise `InputError` if a planner says that it belongs to another scene; a plain function says nothing."""
+    here = task.digest()
+    for name, planner in planners.items():
+        scene = getattr(planner, "scene", None)
+        if scene not in (None, here):
+            raise InputError(
+                f"planner {name!r} belongs to another scene ({scene}) than {task.name} ({here}): "
+                "give other_scene=True to evaluate it all the same"
+            )
+
+
+def _delivered(planner: Planner, delivery: Delivery) -> Planner:
+    """The same planner whose plans come by ``delivery``; one that makes no plans as it is."""
+    return planner.with_parts(delivery=delivery) if isinstance(planner, DynamicPlanner) else planner

@@ -1,0 +1,64 @@
+"""What a model looks like that tells when, and whether, a robot arrives."""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from collections.abc import Callable
+from functools import partial
+from typing import Any, Protocol
+
+import torch
+from torch import Tensor, nn
+
+from torchdyn_plan.errors import InputError
+from torchdyn_plan.nets.distributions import Arrival
+
+
+class ArrivalQuery(Protocol):
+    """What a goal search asks: arrivals of robots in given states, at goals that come later."""
+
+    def __call__(self, goal: Tensor, *, estimator: str = "mode") -> Arrival:
+        """Arrivals ``(*B, K)`` at goals ``(*B, K, 3)`` [m, world]."""
+        ...
+
+
+class ArrivalModel(nn.Module, ABC):
+    """Tells how long a static planner takes to a goal; `torchdyn_plan.nets.ETANetwork` is one."""
+
+    @abstractmethod
+    def arrival(self, robot_state: Tensor, goal: Tensor, *, estimator: str = "mode") -> Arrival:
+        """Arrival ``(*B, K)`` at goals (*B, K, 3) [m, world] from robot states (*B, 1, S).
+
+        ``estimator`` says how a distribution over time becomes one number; a model that knows the time ignores it.
+        """
+
+    def from_state(self, robot_state: Tensor) -> ArrivalQuery:
+        """Arrivals from ``robot_state`` (*B, S): the state's part of the work is done once, where that can be."""
+        return partial(self.arrival, robot_state.unsqueeze(-2))
+
+    def for_inference(self) -> ArrivalModel:
+        """The same function in as few operations as possible; by default the model itself."""
+        return self
+
+
+class FunctionArrival(ArrivalModel):
+    """A person's own function as an arrival model."""
+
+    def __init__(self, function: Callable[[Tensor, Tensor], Any]) -> None:
+        """Wrap ``function``: robot states (*B, 1, S) and goals (*B, K, 3) to an `Arrival`, or to the steps alone."""
+        super().__init__()
+        self.function = function
+
+    @classmethod
+    def wrap(cls, model: Any) -> ArrivalModel:
+        """``model`` if it is an arrival model, else the function that it must be; raises `InputError`."""
+        if isinstance(model, ArrivalModel):
+            return model
+        if not callable(model):
+            raise InputError(f"eta must be an ArrivalModel or a function of robot state and goal, got {model!r}")
+        return cls(model)
+
+    def arrival(self, robot_state: Tensor, goal: Tensor, *, estimator: str = "mode") -> Arrival:
+        """What the function returns; steps that are infinite are *never*."""
+        found = self.function(robot_state, goal)
+        return found if isinstance(found, Arrival) else Arrival(found, torch.isinf(found))

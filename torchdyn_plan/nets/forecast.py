@@ -1,0 +1,88 @@
+"""Where the target is expected, how sure that is, and what a model that tells so looks like."""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from collections.abc import Callable, Sequence
+from typing import TYPE_CHECKING, Any, NamedTuple
+
+from torch import Tensor, nn
+
+from torchdyn_plan import keys
+from torchdyn_plan.errors import InputError
+
+if TYPE_CHECKING:
+    from torchdyn_plan.nets.spread import Spread
+
+
+class Forecast(NamedTuple):
+    """Where the target will be."""
+
+    path: Tensor
+    """``(*B, F, 3)`` [m, world]: entry e-1 is the position in e control steps."""
+    spread: Spread | None = None
+    """How far the path may be off; None where nobody says."""
+
+    def after(self, steps: int) -> Forecast:
+        """The forecast counted from ``steps`` control steps later; raises `InputError` if it does not reach so far."""
+        if steps == 0:
+            return self
+        horizon = self.path.shape[-2]
+        if steps >= horizon:
+            raise InputError(f"delay must be below the forecast's {horizon} steps, got {steps}")
+        return Forecast(self.path[..., steps:, :], None if self.spread is None else self.spread.after(steps))
+
+
+class ForecastModel(nn.Module, ABC):
+    """Forecasts a target's path from what it reads, ``in_keys`` of the observation, by default the target's history."""
+
+    in_keys: Sequence[Any] = (keys.TARGET_HISTORY,)
+    history: int | None = None
+    """Positions H that it reads of the target's history; None for any number."""
+
+    @abstractmethod
+    def predict(self, *seen: Tensor) -> Forecast:
+        """Forecast from the entries ``in_keys``, ``(*B, …)`` each."""
+
+    def for_inference(self) -> ForecastModel:
+        """The same function in as few operations as possible; by default the model itself."""
+        return self
+
+
+class FunctionForecast(ForecastModel):
+    """A person's own function as a forecast model."""
+
+    def __init__(self, function: Callable[..., Any], *, in_keys: Sequence[Any] = (keys.TARGET_HISTORY,)) -> None:
+        """Wrap ``function`` (an `nn.Module` too): the entries ``in_keys`` to a path (*B, F, 3) or a `Forecast`."""
+        super().__init__()
+        self.function, self.in_keys = function, tuple(in_keys)
+
+    @classmethod
+    def wrap(cls, model: Any) -> ForecastModel:
+        """``model`` if it is a forecast model, else the function that it must be; raises `InputError`."""
+        if isinstance(model, ForecastModel):
+            return model
+        if not callable(model):
+            raise InputError(f"forecaster must be a ForecastModel or a function of the history, got {model!r}")
+        return cls(model)
+
+    def predict(self, *seen: Tensor) -> Forecast:
+        """What the function returns."""
+        found = self.function(*seen)
+        return found if isinstance(found, Forecast) else Forecast(found)
+
+
+class DescribedForecast(ForecastModel):
+    """A forecast model that also tells what it saw, from which its errors can be judged."""
+
+    @abstractmethod
+    def forward(self, target_history: Tensor) -> Tensor:
+        """Positions at the next F control steps, ``(*B, F, 3)`` [m, world], after histories ``(*B, H, 3)``."""
+
+    @abstractmethod
+    def describe(self, target_history: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        """The same positions, the features (*B, hidden) behind them, and whether x and y are swapped in these (*B,)."""
+
+    def predict(self, *seen: Tensor) -> Forecast:
+        """The path alone."""
+        return Forecast(self(*seen))

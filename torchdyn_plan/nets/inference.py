@@ -1,0 +1,312 @@
+"""Networks for inference: the same functions in fewer operations, with scales and layouts put into the weights.
+
+At one row a network costs what its operations cost to launch, hardly what they compute.
+"""
+
+from __future__ import annotations
+
+import copy
+import math
+from functools import partial
+from typing import TYPE_CHECKING, Any
+
+import torch
+from torch import Tensor, nn
+
+from torchdyn_plan.checks import check_choice, check_finite, check_same_device, check_trailing_shape
+from torchdyn_plan.nets.arrival import ArrivalModel, ArrivalQuery
+from torchdyn_plan.nets.distributions import ESTIMATORS, Arrival, Spread, arrival_moments
+from torchdyn_plan.nets.forecast import DescribedForecast, Forecast
+
+if TYPE_CHECKING:
+    from torchdyn_plan.nets.eta import ETANetwork
+    from torchdyn_plan.nets.forecaster import Forecaster
+    from torchdyn_plan.nets.spread import SpreadNetwork
+
+DENSE = 2**14
+"""A convolution of at most so many weights, written out as one matrix over all steps, is cheaper as that matrix."""
+
+
+def hold_constants(module: nn.Module, dtype: torch.dtype, **constants: Tensor) -> None:
+    """Register ``constants`` as buffers of ``module``: neither trained, nor saved."""
+    for name, value in constants.items():
+        module.register_buffer(name, value.detach().to(dtype).contiguous(), persistent=False)
+
+
+class InferenceForecaster(DescribedForecast):
+    """`Forecaster` for inference; forecasts differ by rounding alone.
+
+    The one exception: with square symmetry, a target that stands still within a millimetre of a cushion is taken to
+    be on its way to that cushion.
+    """
+
+    zero: Tensor
+    turns: Tensor
+    octants: Tensor
+    embed_weight: Tensor
+    embed_bias: Tensor
+    join_weight: Tensor
+    join_bias: Tensor
+    hidden_weight: Tensor
+    hidden_bias: Tensor
+    mix_weight: Tensor
+    mix_bias: Tensor
+    head_weight: Tensor
+    head_bias: Tensor
+    spread_hidden_weight: Tensor
+    spread_hidden_bias: Tensor
+    spread_mix_weight: Tensor
+    spread_mix_bias: Tensor
+    spread_head_weight: Tensor
+    spread_head_bias: Tensor
+
+    def __init__(self, network: Forecaster, spread: SpreadNetwork | None = None) -> None:
+        """Take the weights of ``network``, and of the ``spread`` that judges it, as they are now."""
+        super().__init__()
+        self.config = config = network.config
+        self.history, self.judged = config.history, spread is not None
+        dtype, exact = network.head.weight.dtype, copy.deepcopy(network).double()
+        hold_constants(self, dtype, turns=_turns(exact), octants=_octants(exact))
+        embed: Any = exact.embed
+        weight = embed.weight.squeeze(-1) * exact._step_scale
+        hold_constants(self, dtype, embed_weight=weight.mT, embed_bias=embed.bias, zero=torch.zeros(1))
+        length, self.dense = config.history - 1, []
+        for number, layer in enumerate(exact.convolve):
+            weight, bias, length, dense = _convolution(layer, length)
+            self.dense.append(dense)
+            hold_constants(self, dtype, **{f"convolve_weight_{number}": weight, f"convolve_bias_{number}": bias})
+        weight, bias = _join(exact)
+        hold_constants(self, dtype, join_weight=weight.mT, join_bias=bias)
+        hold_constants(self, dtype, hidden_weight=exact.hidden.weight.mT, hidden_bias=exact.hidden.bias)
+        hold_constants(self, dtype, mix_weight=exact.mix.weight.mT, mix_bias=exact.mix.bias)
+        weight, bias = _head(exact)
+        hold_constants(self, dtype, head_weight=weight.mT, head_bias=bias)
+        if spread is not None:
+            for name in ("hidden", "mix", "head"):
+                layer = getattr(spread, name)
+                constants = {f"spread_{name}_weight": layer.weight.mT, f"spread_{name}_bias": layer.bias}
+                hold_constants(self, dtype, **constants)
+
+    def forward(self, target_history: Tensor) -> Tensor:
+        """Positions at the next F control steps, ``(*B, F, 3)`` [m, world], as `Forecaster.forward` describes."""
+        return self._forecast(target_history)[0]
+
+    def describe(self, target_history: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        """The same forecast, and what a spread is told by, as `Forecaster.describe` describes."""
+        forecast, hidden, turn = self._forecast(target_history)
+        batch = target_history.shape[:-2]
+        return forecast, hidden.view(*batch, self.config.hidden), (turn[:, 0, 0] == 0.0).view(batch)
+
+    def _forecast(self, target_history: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        """Positions (*B, F, 3), hidden features (R, hidden) and how each row was turned (R, 3, 7)."""
+        config = self.config
+        _check("target_history", target_history, self.head_weight.device, config.history, 3)
+        history = target_history.reshape(-1, config.history, 3)
+        if config.square_symmetry:
+            # The nearest of the eight octants' middles says how a row is turned, and its line turned back and shifted.
+            now = history[:, -1]
+            direction = (now - history[:, -2]).add_(now, alpha=1e-6)
+            turn = self.turns.index_select(0, direction.mm(self.octants).argmax(dim=-1))
+        else:
+            turn = self.turns[:1].expand(len(history), 3, 7)
+        history = torch.bmm(history, turn[..., :3])
+        step, now = history[:, 1:] - history[:, :-1], history[:, -1]
+        line, hidden = self._line(step, now, step[:, -1])
+        if config.half_extent is not None:
+            level = line[:, :2]
+            level.sub_(level.round()).abs_()
+        path = torch.bmm(turn[..., 3:6], line).add_(turn[..., 6:])
+        return path.mT.view(*target_history.shape[:-2], config.horizon, 3), hidden, turn
+
+    def predict(self, *seen: Tensor) -> Forecast:
+        """The path, and its spread if there is a network that judges it."""
+        path, hidden, turn = self._forecast(*seen)
+        return Forecast(path, self._spread(hidden, turn, path.shape[:-2]) if self.judged else None)
+
+    def _spread(self, hidden: Tensor, turn: Tensor, batch: torch.Size) -> Spread:
+        """What `SpreadNetwork.forward` makes of features (R, hidden) of rows that were turned (R, 3, 7)."""
+        features = torch.addmm(self.spread_hidden_bias, hidden, self.spread_hidden_weight).relu_()
+        features = torch.addmm(self.spread_mix_bias, features, self.spread_mix_weight)
+        out = torch.addmm(self.spread_head_bias, features, self.spread_head_weight)
+        out = out.view(len(hidden), 5, self.config.horizon)
+        # Entries 0 and 1 are the scales, 2 and 3 the shapes, along x and y or, in rows whose axes are swapped, y and x.
+        swapped = (turn[:, :1, :1] == 0.0).unsqueeze(-1)
+        level = out[:, :4].view(len(hidden), 2, 2, self.config.horizon)
+        level = torch.where(swapped, level.flip(2), level).mT
+        scale, shape = level[:, 0].clamp(-18.0, 4.0).exp(), level[:, 1].clamp(-3.0, 3.0).exp()
+        gone = out[:, 4].sigmoid()
+        return Spread(scale.unflatten(0, batch), shape.unflatten(0, batch), gone.unflatten(0, batch))
+
+    def _line(self, step: Tensor, now: Tensor, newest: Tensor) -> tuple[Tensor, Tensor]:
+        """Unreflected line (R, 3, F) and hidden features; with cushions x and y count in periods of the reflection."""
+        real = step.any(dim=-1, keepdim=True).to(step.dtype)
+        change = torch.addcmul(self.zero, step - step[:, -1:], real, value=1.0 / self.config.change_scale).asinh_()
+        features = torch.cat([step, change, real], dim=-1).view(-1, 7)
+        features = torch.addmm(self.embed_bias, features, self.embed_weight).relu_()
+        for number, dense in enumerate(self.dense):
+            if dense:
+                features = features.view(len(step), -1)
+            else:
+                steps = features.view(len(step), -1, self.config.channels)
+                features = steps.unfold(1, 3, 2).mT.reshape(-1, 3 * self.config.channels)
+            weight, bias = getattr(self, f"convolve_weight_{number}"), getattr(self, f"convolve_bias_{number}")
+            features = torch.addmm(bias, features, weight).relu_()
+        joined = torch.cat([features.view(len(step), -1), now, newest, *self._ahead(now, newest)], dim=-1)
+        hidden = torch.addmm(self.join_bias, joined, self.join_weight).relu_()
+        hidden = torch.addmm(self.hidden_bias, hidden, self.hidden_weight).relu_()
+        mixed = torch.addmm(self.mix_bias, hidden, self.mix_weight)
+        mixed = torch.cat([mixed, now, newest], dim=-1)
+        line = torch.addmm(self.head_bias, mixed, self.head_weight).view(len(step), 3, self.config.horizon)
+        return line, hidden
+
+    def _ahead(self, now: Tensor, newest: Tensor) -> tuple[Tensor, ...]:
+        """When and where the newest position and step, ``(R, 3)`` each, lead to a cushion, ``(R, 2)`` each."""
+        extent, most = self.config.half_extent, 2.0 * self.config.horizon
+        if extent is None:
+            return ()
+        place, speed = now[:, :2], newest[:, :2]
+        if self.config.square_symmetry:
+            wait = (extent - place).div_(speed.clamp_min(1e-6)).clamp_(0.0, most)
+        else:
+            direction = torch.where(speed < 0, -1.0, 1.0)
+            wait = (extent - place * direction).div_((speed * direction).clamp_min(1e-6)).clamp_(0.0, most)
+        period = torch.addcmul(place, speed, wait.flip(-1)).sub_(extent).mul_(0.25 / extent)
+        return wait, wait.log1p(), period.sub_(period.round()).abs_()
+
+
+class InferenceETA(ArrivalModel):
+    """`ETANetwork` for inference; scores differ by rounding alone."""
+
+    state_weight: Tensor
+    state_bias: Tensor
+    goal_weight: Tensor
+    second_weight: Tensor
+    second_bias: Tensor
+    third_weight: Tensor
+    third_bias: Tensor
+    head_weight: Tensor
+    head_bias: Tensor
+    square_sums: Tensor
+    moments: Tensor
+
+    def __init__(self, network: ETANetwork) -> None:
+        """Take the weights of ``network`` as they are now."""
+        super().__init__()
+        self.config = config = network.config
+        dtype, exact = network.head.weight.dtype, copy.deepcopy(network).double()
+        goal, offset, lengths = (exact.goal_in.weight * exact.goal_scale).split([3, 3, 2], dim=1)
+        bias = exact.state_in.bias + exact.state_in.weight @ exact.state_shift + exact.goal_in.weight @ exact.goal_shift
+        state = (exact.state_in.weight * exact.state_scale).clone()
+        state[:, slice(*config.tool_slice)] -= offset
+        hold_constants(self, dtype, state_weight=state.mT, state_bias=bias)
+        hold_constants(self, dtype, goal_weight=torch.cat([goal + offset, lengths], dim=1).mT)
+        for name in ("second", "third", "head"):
+            layer = getattr(exact, name)
+            hold_constants(self, dtype, **{f"{name}_weight": layer.weight.mT, f"{name}_bias": layer.bias})
+        hold_constants(self, dtype, square_sums=torch.tensor([[1.0, 1.0], [1.0, 1.0], [0.0, 1.0]]))
+        hold_constants(
+            self, dtype, moments=arrival_moments(exact.head.weight.new_empty(config.bins + 1), config.bin_width)
+        )
+
+    def forward(self, robot_state: Tensor, goal: Tensor) -> Tensor:
+        """Scores of the bins, ``(*B, bins + 1)``, as `ETANetwork.forward` describes."""
+        return self.scores(*self._share(robot_state), goal)
+
+    def arrival(self, robot_state: Tensor, goal: Tensor, *, estimator: str = "mode") -> Arrival:
+        """Arrival time at ``goal (*B, 3)`` from ``robot_state (*B, S)``, as `ETANetwork.arrival` describes."""
+        return self.read(*self._share(robot_state), goal, estimator=estimator)
+
+    def from_state(self, robot_state: Tensor) -> ArrivalQuery:
+        """Arrivals from ``robot_state`` (*B, S) at goals (*B, K, 3): the state's part of the work is done once."""
+        return partial(self.read, *self._share(robot_state.unsqueeze(-2)))
+
+    def _share(self, robot_state: Tensor) -> tuple[Tensor, Tensor]:
+        """The tool's place in states (*B, S), and their share of the first layer, ``(*B, hidden)``."""
+        _check("robot_state", robot_state, self.head_weight.device, self.config.robot_state_size)
+        tool_pos = robot_state[..., slice(*self.config.tool_slice)]
+        return tool_pos, nn.functional.linear(robot_state, self.state_weight.mT, self.state_bias)
+
+    def read(self, tool_pos: Tensor, state: Tensor, goal: Tensor, *, estimator: str = "mode") -> Arrival:
+        """Arrival time at ``goal`` (*B, 3) for tools (*B, 3) and the states' share of the first layer (*B, hidden)."""
+        scores, width = self.scores(tool_pos, state, goal), self.config.bin_width
+        if estimator in ("expectation", "distribution"):
+            return ESTIMATORS[estimator](scores, bin_width=width, moments=self.moments)
+        check_choice("estimator", estimator, ESTIMATORS)
+        return ESTIMATORS[estimator](scores, bin_width=width)
+
+    def scores(self, tool_pos: Tensor, state: Tensor, goal: Tensor) -> Tensor:
+        """Scores ``(*B, bins + 1)`` for tools (*B, 3), the states' share of the first layer, and goals (*B, 3)."""
+        _check("goal", goal, state.device, 3)
+        offset = goal - tool_pos
+        lengths = (offset.square() @ self.square_sums).sqrt_()
+        hidden = (torch.cat([goal.expand(offset.shape), lengths], dim=-1) @ self.goal_weight).add_(state).relu_()
+        rows = torch.addmm(self.second_bias, hidden.view(-1, self.config.hidden), self.second_weight).relu_()
+        rows = torch.addmm(self.third_bias, rows, self.third_weight).relu_()
+        rows = torch.addmm(self.head_bias, rows, self.head_weight)
+        return rows.view(*hidden.shape[:-1], self.config.bins + 1)
+
+
+def _check(name: str, tensor: Tensor, device: torch.device, *trailing: int) -> None:
+    """Raise `InputError` for a wrong shape or device, or for what is no number: a quick look, then a thorough one."""
+    if torch.compiler.is_compiling():
+        return
+    if tensor.shape[-len(trailing) :] == trailing and tensor.device == device and math.isfinite(tensor.sum().item()):
+        return
+    check_trailing_shape(name, tensor, *trailing)
+    check_same_device(name, tensor, device, "the network")
+    check_finite(name, tensor)
+
+
+def _turns(network: Forecaster) -> Tensor:
+    """For each symmetry (8, 3, 7): the turn of the history, the turn back of the line's units, and their shift."""
+    turn, extent = network.symmetries.double(), network.config.half_extent
+    unit, shift = turn.new_ones(3), turn.new_zeros(3)
+    if extent is not None:
+        unit[:2], shift[:2] = -4.0 * extent, extent
+    return torch.cat([turn, turn * unit, turn @ shift.view(3, 1)], dim=-1)
+
+
+def _octants(network: Forecaster) -> Tensor:
+    """Middles (3, 8) of the octants that the symmetries turn into the first: the nearest one of a direction is its."""
+    middle = torch.tensor([0.9238795325112867, 0.3826834323650898, 0.0], dtype=torch.float64)
+    return (network.symmetries.double() @ middle).mT
+
+
+def _convolution(layer: Any, length: int) -> tuple[Tensor, Tensor, int, bool]:
+    """Weight, bias and length of the output of a convolution of ``length`` steps, and whether it is written out."""
+    from torchdyn_plan.nets.forecaster import convolve
+
+    channels = layer.in_channels
+    unit = torch.eye(length * channels, dtype=torch.float64).view(-1, length, channels)
+    none = convolve(torch.zeros_like(unit[:1]), layer)
+    written = (convolve(unit, layer) - none).flatten(1)
+    after, padded = none.shape[1], length < 3 or (length - 3) % 2 != 0
+    if padded or written.numel() <= DENSE:
+        return written, none.flatten(), after, True
+    return layer.weight.permute(2, 1, 0).flatten(0, 1), layer.bias, after, False
+
+
+def _join(network: Forecaster) -> tuple[Tensor, Tensor]:
+    """Weight and bias of the layer that joins convolved steps (features inmost), and the present's bare features."""
+    config, weight, bias = network.config, network.join.weight.clone(), network.join.bias.clone()
+    present = len(network._present_scale)
+    weight[:, -present:] *= network._present_scale
+    if config.half_extent is not None:
+        bias += config.half_extent * weight[:, -2:].sum(1)
+        weight[:, -2:] *= -4.0 * config.half_extent
+    return weight, bias
+
+
+def _head(network: Forecaster) -> tuple[Tensor, Tensor]:
+    """Weight and bias that give the line, in `InferenceForecaster`'s units, for mixture, newest position and step."""
+    extent, horizon = network.config.half_extent, network.config.horizon
+    scale, unit = network._scale.reshape(-1), network._scale.new_ones(3, 1)
+    weight, bias = network.head.weight * scale.unsqueeze(-1), (network.head.bias * scale).view(3, horizon)
+    eye = torch.eye(3, dtype=torch.float64).unsqueeze(1)
+    now = eye.expand(3, horizon, 3)
+    newest = eye * network._time.unsqueeze(-1)
+    whole = torch.cat([weight.view(3, horizon, -1), now, newest], dim=-1)
+    if extent is not None:
+        unit[:2] = 0.25 / extent
+        bias[:2] -= extent
+    return (whole * unit.unsqueeze(-1)).flatten(0, 1), (bias * unit).flatten()

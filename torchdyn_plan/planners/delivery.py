@@ -1,0 +1,121 @@
+"""Planning takes time: how plans come into use late. A planner without a delivery uses them at once."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any, ClassVar, NamedTuple, Protocol
+
+import torch
+from torch import Tensor
+
+from torchdyn_plan.checks import check_number
+from torchdyn_plan.planners.observation import Observation
+from torchdyn_plan.planners.plan import Plan
+from torchdyn_plan.planners.rows import any_row, where_rows
+
+MakePlans = Callable[[Tensor, Observation, Plan, Plan], Plan]
+"""Makes new plans in the rows of a mask ``(*B,)``, from the observation and the plan in use; the other rows are those
+of the last argument."""
+
+
+class Delivery(Protocol):
+    """How plans come into use late; what it remembers from step to step is its ``State``."""
+
+    State: ClassVar[type[Any]]
+    """A `NamedTuple` of tensors ``(*B, …)``."""
+
+    @property
+    def delay(self) -> int:
+        """Control steps for which a planner plans ahead: when it plans for is when the plan comes into use."""
+        ...
+
+    def start(self, plan: Plan, /) -> Any:
+        """State of rows at their first step, whose ``plan`` is to hold still."""
+        ...
+
+    def older(self, state: Any, /) -> Any:
+        """The state one control step later."""
+        ...
+
+    def arrive(self, plan: Plan, state: Any, observation: Observation, /) -> tuple[Plan, Tensor]:
+        """Plans in use at this step, and ``(*B,)`` bool where one is still under way.
+
+        Args:
+            plan: in use until now.
+            state: of this step.
+            observation: of this step.
+        """
+        ...
+
+    def order(
+        self, make: MakePlans, due: Tensor, observation: Observation, plan: Plan, state: Any, /
+    ) -> tuple[Plan, Any]:
+        """Begin plans in the rows ``due`` (*B,); the plans in use stay.
+
+        Returns:
+            The plans that were made, as far as they are known (else those in use), and the next state.
+        """
+        ...
+
+
+class Pending(NamedTuple):
+    """A plan under way in each row: the fields of `Plan`, and when it arrives."""
+
+    goal: Tensor
+    arrival_steps: Tensor
+    clamped: Tensor
+    reachable: Tensor
+    usable: Tensor
+    path: Tensor
+    age: Tensor
+    steps: Tensor
+    """``(*B,)`` int64 control steps from now until it comes into use; negative for none."""
+
+    @property
+    def plan(self) -> Plan:
+        """The plan itself."""
+        return Plan(**{field: getattr(self, field) for field in Plan._fields})
+
+
+@dataclass(frozen=True)
+class Delayed:
+    """A plan takes effect some control steps after it was begun, and until then no other is begun in its row."""
+
+    steps: int
+    """Control steps from what a plan was made from to its use."""
+    compensate: bool = True
+    """The planner plans for the moment of use; otherwise it takes what comes late for new."""
+
+    State: ClassVar[type[Pending]] = Pending
+
+    def __post_init__(self) -> None:
+        check_number("steps", self.steps, minimum=1, integer=True)
+
+    @property
+    def delay(self) -> int:
+        """Control steps for which the planner plans ahead."""
+        return self.steps if self.compensate else 0
+
+    def start(self, plan: Plan) -> Pending:
+        """No plan is under way."""
+        return Pending(*plan, steps=torch.full_like(plan.age, -1))
+
+    def older(self, state: Pending) -> Pending:
+        """One step nearer."""
+        return state._replace(steps=state.steps - 1)
+
+    def arrive(self, plan: Plan, state: Pending, observation: Observation) -> tuple[Plan, Tensor]:
+        """Those that are due to arrive now."""
+        now = state.steps == 0
+        if any_row(now):
+            plan = Plan(*(where_rows(now, new, old) for new, old in zip(state.plan, plan, strict=True)))
+        return plan, state.steps > 0
+
+    def order(
+        self, make: MakePlans, due: Tensor, observation: Observation, plan: Plan, state: Pending
+    ) -> tuple[Plan, Pending]:
+        """Plan, and let it wait."""
+        made = make(due, observation, plan, state.plan)
+        steps = state.steps.clamp_min(0).masked_fill(due, self.steps)
+        return made, Pending(*made, steps=steps)

@@ -1,0 +1,37 @@
+"""What a dynamic planner sees of its robots and their targets at one step."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import NamedTuple
+
+from torch import Tensor
+
+from torchdyn_plan import keys
+
+SEEN_BY_ALL = (keys.TOOL_POS, keys.TARGET_POS, keys.ROBOT_STATE, keys.STEP_COUNT)
+"""Keys of an observation beside those that the forecaster reads."""
+
+
+class Observation(NamedTuple):
+    """One step of a batch of robots."""
+
+    tool_pos: Tensor
+    """``(*B, 3)`` [m, world]."""
+    target_pos: Tensor
+    """``(*B, 3)`` [m, world]."""
+    robot_state: Tensor
+    """``(*B, S)``: what the arrival model reads."""
+    step_count: Tensor
+    """``(*B,)`` int64 control steps since the reset."""
+    seen: tuple[Tensor, ...]
+    """What the forecaster reads, ``(*B, …)`` each."""
+
+    def flat(self) -> tuple[Tensor, ...]:
+        """Every tensor, one after the other."""
+        return (*self[:4], *self.seen)
+
+    @classmethod
+    def of(cls, tensors: Sequence[Tensor]) -> Observation:
+        """The observation of which `flat` gave ``tensors``."""
+        return cls(tensors[0], tensors[1], tensors[2], tensors[3], tuple(tensors[4:]))

@@ -1,0 +1,103 @@
+"""What a dynamic planner is made of: parts that can be exchanged, and what follows from them."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any, Self
+
+import torch
+from torch import Tensor
+
+from torchdyn_plan import keys
+from torchdyn_plan.checks import check_choice, check_number
+from torchdyn_plan.errors import InputError
+from torchdyn_plan.nets.arrival import ArrivalModel, FunctionArrival
+from torchdyn_plan.nets.forecast import ForecastModel, FunctionForecast
+from torchdyn_plan.planners.delivery import Delivery
+from torchdyn_plan.planners.maneuver import GoTo, Maneuver
+from torchdyn_plan.planners.memory import REPORTED, PlannerMemory, Remembering
+from torchdyn_plan.planners.observation import SEEN_BY_ALL, Observation
+from torchdyn_plan.planners.plan import Lost
+from torchdyn_plan.planners.pretrained import PretrainedPlanner
+from torchdyn_plan.planners.protocol import keys_read, keys_written
+from torchdyn_plan.planners.schedule import ReplanSchedule, Schedule
+from torchdyn_plan.planners.search.corner import CornerSearch
+from torchdyn_plan.planners.search.meeting import GoalSearch
+from torchdyn_plan.planners.static.callable import TensorDictFunction
+
+PARTS = ("static", "forecaster", "eta", "search", "schedule", "maneuver", "delivery", "lost", "chunk", "scene")
+"""Arguments of a `ComposedPlanner`, and its attributes."""
+
+
+class ComposedPlanner(PretrainedPlanner, Remembering):
+    """Holds the parts of a planner for a moving target; `DynamicPlanner` says what is done with them.
+
+    Parts do not change afterwards: `with_parts` makes another planner.
+    """
+
+    def __init__(
+        self,
+        static: Callable[..., Any],
+        forecaster: ForecastModel | Callable[..., Any],
+        eta: ArrivalModel | Callable[..., Any],
+        *,
+        search: GoalSearch | None = None,
+        schedule: Schedule | None = None,
+        maneuver: Maneuver | None = None,
+        delivery: Delivery | None = None,
+        lost: Lost | None = None,
+        chunk: int | None = None,
+        scene: str | None = None,
+    ) -> None:
+        """Join the parts.
+
+        Args:
+            static: planner for a static goal, from tensordict to tensordict (`StaticPlanner`).
+            forecaster: forecasts the target; a function of its history will do, which returns positions (*B, F, 3).
+            eta: tells how long ``static`` takes to a goal; a function of robot states (*B, 1, S) and goals (*B, K, 3)
+                will do, which returns control steps (*B, K).
+            search: chooses the meeting on the forecast; the paper's corner search by default.
+            schedule: when to plan anew; the paper's by default.
+            maneuver: which goal the static planner is sent to at each step; the meeting place, as in the paper, by
+                default.
+            delivery: how plans come into use late: `Delayed`, or made in the `Background`; at once by default.
+            lost: when a target is lost; None if it cannot be.
+            chunk: plan in blocks of exactly this many rows, so that results do not depend on the batch size.
+            scene: digest of the scene that the planner belongs to; None if it belongs to none.
+        """
+        super().__init__()
+        if chunk is not None:
+            check_number("chunk", chunk, minimum=1, integer=True)
+        self.static = TensorDictFunction.wrap(static)
+        self.forecaster, self.eta = FunctionForecast.wrap(forecaster), FunctionArrival.wrap(eta)
+        self.search, self.schedule = search or CornerSearch(), schedule or ReplanSchedule()
+        self.maneuver, self.delivery = maneuver or GoTo(), delivery
+        self.lost, self.chunk, self.scene = lost, chunk, scene
+        self.memory = PlannerMemory(self.schedule, self.maneuver, delivery)
+        remembered = [(keys.PLAN, name) for name in self.memory.names]
+        reported = [(keys.PLAN, name) for name in REPORTED]
+        self.in_keys = keys_read(self.static, *SEEN_BY_ALL, *self.forecaster.in_keys, *remembered)
+        shared = [str(key[-1]) for key in (*remembered, *reported) if key in self.static.out_keys]
+        if shared:
+            raise InputError(f"the static planner and the planner both remember {', '.join(shared)}")
+        self.out_keys = keys_written(self.static, keys.GOAL, keys.ARRIVAL_STEPS, *remembered, *reported)
+
+    def with_parts(self, **parts: Any) -> Self:
+        """Another planner of the same parts, but for those given, by the names of the constructor's arguments."""
+        for name in parts:
+            check_choice("part", name, PARTS)
+        return type(self)(**(self.part_settings() | parts)).train(self.training)
+
+    def part_settings(self) -> dict[str, Any]:
+        """Arguments that make the same planner."""
+        return {name: getattr(self, name) for name in PARTS}
+
+    def for_inference(self) -> Self:
+        """The same planner on copies of its networks as they are now, in as few operations as possible."""
+        return self.with_parts(forecaster=self.forecaster.for_inference(), eta=self.eta.for_inference())
+
+    def empty_memory(self, like: Tensor) -> dict[str, Tensor]:
+        """Entries below ``plan`` of rows at step 0, the static planner's among them; as `Remembering` says."""
+        step = torch.zeros(like.shape[:-1], dtype=torch.int64, device=like.device)
+        entries = self.memory.empty(Observation(like, like, like, step, ()))
+        return entries | (self.static.empty_memory(like) if isinstance(self.static, Remembering) else {})

@@ -1,0 +1,158 @@
+"""A plan: where and when robot and target will meet, how it stands, and when its target is lost."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from enum import IntEnum
+from typing import NamedTuple, Protocol
+
+import torch
+from torch import Tensor
+
+from torchdyn_plan.checks import check_number
+from torchdyn_plan.planners.observation import Observation
+from torchdyn_plan.planners.search.meeting import Meeting
+
+FARTHEST = 1e3
+"""A forecast that leads farther than this is none [m]."""
+
+
+class PlanStatus(IntEnum):
+    """Codes of ``plan.status``, row by row; from `BAD_FORECAST` on a row whose plan is due holds its tool still."""
+
+    OK = 0
+    """The robot can be in time for the planned meeting."""
+    WAITING = 1
+    """The first plan is still to come."""
+    UNREACHABLE = 2
+    """The robot cannot be in time for any meeting on the forecast; the goal is only a direction."""
+    BAD_FORECAST = 3
+    """The forecast holds a NaN or an infinity, or leads out of the world."""
+    TARGET_LOST = 4
+    """The target is lost."""
+    BAD_INPUT = 5
+    """The target's position, or what the forecaster reads, holds a NaN or an infinity."""
+
+
+class Lost(Protocol):
+    """Says of places whether a target there is lost; a task whose targets cannot be lost has none."""
+
+    def seen(self, target_pos: Tensor) -> Tensor:
+        """Whether a target that is seen at ``target_pos`` (*B, 3) [m, world] is lost: ``(*B,)`` bool."""
+        ...
+
+    def forecast(self, path: Tensor) -> Tensor:
+        """Whether a target that is forecast at each place of ``path`` (*B, F, 3) is lost there: ``(*B, F)`` bool."""
+        ...
+
+
+@dataclass(frozen=True, kw_only=True)
+class LostBelow:
+    """A target is lost once it is below a height."""
+
+    seen_below: float
+    """Height below which a target that is seen is lost [m, world]."""
+    forecast_below: float
+    """A target that is forecast at this height or below is taken for lost [m, world]; between the heights of targets
+    that are lost and of those that are not, as a forecast that is unsure lies between them."""
+
+    def __post_init__(self) -> None:
+        check_number("seen_below", self.seen_below)
+        check_number("forecast_below", self.forecast_below)
+
+    def seen(self, target_pos: Tensor) -> Tensor:
+        """As `Lost.seen`."""
+        return target_pos[..., 2] < self.seen_below
+
+    def forecast(self, path: Tensor) -> Tensor:
+        """As `Lost.forecast`."""
+        return path[..., 2] <= self.forecast_below
+
+
+class Plan(NamedTuple):
+    """The plan in use in each row."""
+
+    goal: Tensor
+    """``(*B, 3)`` [m, world]."""
+    arrival_steps: Tensor
+    """``(*B,)`` int64 control steps from now to the meeting."""
+    clamped: Tensor
+    """``(*B,)`` bool, as `Meeting.clamped`."""
+    reachable: Tensor
+    """``(*B,)`` bool, as `Meeting.reachable`."""
+    usable: Tensor
+    """``(*B,)`` bool: the forecast from which it was made was of use."""
+    path: Tensor
+    """``(*B, T, 3)`` [m, world]: where the target was expected in 0 … T-1 steps from the moment it was made for."""
+    age: Tensor
+    """``(*B,)`` int64 control steps since that moment; -1 where no plan was made yet."""
+
+    @classmethod
+    def hold(cls, observation: Observation, length: int) -> Plan:
+        """The plan of rows that have none: stay where the tool is, and expect the target to stay where it is."""
+        tool_pos, target_pos, step = observation.tool_pos, observation.target_pos, observation.step_count
+        yes = torch.ones_like(step, dtype=torch.bool)
+        at_rest = target_pos.unsqueeze(-2).expand(*target_pos.shape[:-1], length, 3)
+        return cls(tool_pos, torch.zeros_like(step), ~yes, yes, yes, at_rest, torch.full_like(step, -1))
+
+    @classmethod
+    def make(cls, meeting: Meeting, usable: Tensor, target_pos: Tensor, path: Tensor, length: int) -> Plan:
+        """A new plan.
+
+        Args:
+            meeting: what the search found.
+            usable: ``(*B,)`` whether the forecast was of use.
+            target_pos: ``(*B, 3)`` the target at the moment for which the plan is made [m, world].
+            path: ``(*B, F, 3)`` where it is expected from then on.
+            length: positions to remember; the last one is repeated where the forecast ends.
+        """
+        whole = path.narrow(-2, 0, 0)
+        if length:
+            whole = torch.cat([target_pos.unsqueeze(-2), path], dim=-2)
+            whole = whole[..., torch.arange(length, device=path.device).clamp(max=path.shape[-2]), :]
+        return cls(*meeting, usable, whole, torch.zeros_like(meeting.arrival_steps))
+
+    def older(self) -> Plan:
+        """The plan one control step later."""
+        return self._replace(arrival_steps=(self.arrival_steps - 1).clamp_min(0), age=self.age + (self.age >= 0))
+
+    def held(self, rows: Tensor, tool_pos: Tensor) -> Plan:
+        """The plan, but ``rows`` (*B,) bool stay where their tool is, (*B, 3) [m, world]."""
+        if not (torch.compiler.is_compiling() or rows.any()):
+            return self
+        return self._replace(
+            goal=torch.where(rows.unsqueeze(-1), tool_pos, self.goal),
+            arrival_steps=self.arrival_steps.masked_fill(rows, 0),
+            clamped=self.clamped & ~rows,
+            reachable=self.reachable & ~rows,
+        )
+
+    def ahead(self, count: int) -> Tensor:
+        """Where the target is expected now and in 1 … ``count`` - 1 steps, ``(*B, count, 3)``."""
+        ahead = torch.arange(count, device=self.age.device)
+        index = (self.age.clamp_min(0).unsqueeze(-1) + ahead).clamp(max=self.path.shape[-2] - 1)
+        return self.path.gather(-2, index.unsqueeze(-1).expand(*index.shape, 3))
+
+    def status(self, trouble: Tensor, replans: Tensor) -> Tensor:
+        """`PlanStatus` of each row, ``(*B,)`` int64, from the code of its input and how many plans it has made."""
+        code = torch.where(self.reachable, int(PlanStatus.OK), int(PlanStatus.UNREACHABLE))
+        code = torch.where(replans == 0, int(PlanStatus.WAITING), code)
+        code = torch.where(self.usable, code, int(PlanStatus.BAD_FORECAST))
+        return torch.where(trouble > 0, trouble, code)
+
+
+def input_status(observation: Observation, lost: Lost | None) -> Tensor:
+    """`BAD_INPUT`, `TARGET_LOST` or `OK` for each row, ``(*B,)`` int64; ``lost`` says when a target is lost."""
+    target_pos = observation.target_pos
+    # A sum is finite only if all its terms are.
+    total = target_pos.sum(-1)
+    for value in observation.seen:
+        total = total + value.reshape(*total.shape, -1).sum(-1)
+    bad = (~torch.isfinite(total)) * int(PlanStatus.BAD_INPUT)
+    return bad if lost is None else torch.maximum(bad, lost.seen(target_pos) * int(PlanStatus.TARGET_LOST))
+
+
+def usable_path(path: Tensor, target_pos: Tensor) -> tuple[Tensor, Tensor]:
+    """The path ``(*B, F, 3)``, a target at rest at ``target_pos`` (*B, 3) where it is of no use, and its use (*B,)."""
+    usable = path.abs().amax((-2, -1), keepdim=True) <= FARTHEST
+    return torch.where(usable, path, target_pos.unsqueeze(-2)), usable.view(target_pos.shape[:-1])

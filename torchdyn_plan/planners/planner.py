@@ -1,0 +1,134 @@
+"""The idea of this package: a planner for a static target, made to meet a moving one."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from functools import partial
+
+import torch
+from tensordict import TensorDictBase
+from torch import Tensor
+
+from torchdyn_plan import keys
+from torchdyn_plan.checks import check_trailing_shape
+from torchdyn_plan.nets.forecast import Forecast, ForecastModel
+from torchdyn_plan.planners.observation import SEEN_BY_ALL, Observation
+from torchdyn_plan.planners.parts import ComposedPlanner
+from torchdyn_plan.planners.plan import Plan, input_status, usable_path
+from torchdyn_plan.planners.protocol import read
+from torchdyn_plan.planners.rows import apply_to_rows
+from torchdyn_plan.planners.schedule import lateness
+from torchdyn_plan.planners.search.meeting import SearchContext, later
+
+
+class DynamicPlanner(ComposedPlanner):
+    """Meets a moving target: history → forecast → meeting → goal → action.
+
+    Writes ``goal`` (*B, 3) [m, world], ``arrival_steps`` (*B,), what the static planner writes, and under ``plan`` the
+    memory for the next step and each row's `PlanStatus`. A row plans when its schedule says so, and starts afresh at
+    ``step_count`` 0. One that cannot plan, as its input or forecast is no number or its target is lost, holds its tool
+    still and tries again at every step; other rows do not notice. Its parts are those of `ComposedPlanner`.
+    """
+
+    def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
+        """Plan where a plan is due, and act; raises `InputError` for a missing key or a wrong shape."""
+        obs = observe(tensordict, self.forecaster)
+        clock, plan, state, pending = self.memory.recall(tensordict, obs)
+        busy = None
+        if self.delivery is not None:
+            plan, busy = self.delivery.arrive(plan, pending, obs)
+
+        late = partial(lateness, self.eta, obs, plan, self.chunk)
+        ticked, due = self.schedule.tick(clock, obs, plan, busy=busy, late=late)
+        trouble = input_status(obs, self.lost)
+        planned, holds = due, ~plan.usable
+        if self.delivery is not None or torch.compiler.is_compiling() or due.any():
+            able = due & (trouble == 0)
+            make = partial(replan_rows, self.replan, chunk=self.chunk)
+            if self.delivery is None:
+                plan = made = make(able, obs, plan, plan)
+            else:
+                made, pending = self.delivery.order(make, able, obs, plan, pending)
+            planned = able & made.usable
+            if torch.compiler.is_compiling() or (due & ~planned).any():
+                ticked = ticked.retry(due & ~planned, clock)
+            holds = (due & ~able) | ~plan.usable
+
+        plan = plan.held(holds, obs.tool_pos)
+        goal, state = self.maneuver(plan, obs, holds, state)
+
+        status = plan.status(trouble, ticked.replans)
+        self.memory.remember(tensordict, (ticked, plan, state, pending), replanned=planned, status=status)
+        tensordict.set(keys.GOAL, goal)
+        tensordict.set(keys.ARRIVAL_STEPS, plan.arrival_steps)
+        return self.static(tensordict)
+
+    def replan(self, observation: Observation, plan: Plan) -> Plan:
+        """A new plan for every row, from what is seen and the plan in use: pure, and the one entry to planning."""
+        delay = 0 if self.delivery is None else self.delivery.delay
+        forecast = self.forecaster.predict(*observation.seen)
+        path, usable = usable_path(forecast.path, observation.target_pos)
+        forecast, target_pos = Forecast(path, forecast.spread), observation.target_pos
+        eta, planned_steps = self.eta.from_state(observation.robot_state), plan.arrival_steps
+        if delay:
+            # From here on all is counted from when the plan comes into use.
+            forecast, eta = forecast.after(delay), later(eta, delay)
+            target_pos, planned_steps = path[..., delay - 1, :], (planned_steps - delay).clamp_min(0)
+        context = SearchContext(observation.tool_pos, planned_steps, self.lost)
+        meeting = self.search(forecast, target_pos, eta, context)
+        return Plan.make(meeting, usable, target_pos, forecast.path, self.memory.path_length)
+
+
+def observe(tensordict: TensorDictBase, forecaster: ForecastModel) -> Observation:
+    """What a planner with this ``forecaster`` sees; raises `InputError` for a missing key or a wrong shape."""
+    wanted = (*SEEN_BY_ALL, *forecaster.in_keys)
+    values = [tensordict.get(key, None) for key in wanted]
+    if any(value is None for value in values):
+        values = [read(tensordict, key, "DynamicPlanner") for key in wanted]
+    tool_pos, target_pos, robot_state, step_count, *seen = values
+    if not torch.compiler.is_compiling():
+        if tool_pos.shape[-1:] != (3,) or target_pos.shape[-1:] != (3,):
+            check_trailing_shape(keys.TOOL_POS, tool_pos, 3)
+            check_trailing_shape(keys.TARGET_POS, target_pos, 3)
+        if keys.TARGET_HISTORY in forecaster.in_keys:
+            history = seen[forecaster.in_keys.index(keys.TARGET_HISTORY)]
+            length = forecaster.history or history.shape[-2]
+            if history.shape[-2:] != (length, 3):
+                check_trailing_shape(keys.TARGET_HISTORY, history, length, 3)
+    return Observation(tool_pos, target_pos, robot_state, step_count.reshape(tool_pos.shape[:-1]), tuple(seen))
+
+
+def replan_rows(
+    replan: Callable[[Observation, Plan], Plan],
+    rows: Tensor,
+    observation: Observation,
+    plan: Plan,
+    others: Plan,
+    *,
+    chunk: int | None,
+) -> Plan:
+    """New plans in some rows.
+
+    Args:
+        replan: makes a new plan for every row that it is given.
+        rows: ``(*B,)`` bool: those that plan.
+        observation: of this step.
+        plan: in use.
+        others: plans of the other rows.
+        chunk: rows that ``replan`` is given at once; None for all of them.
+    """
+    # Planning reads no old path: rows are gathered without it.
+    bare = plan._replace(path=plan.path[..., :0, :])
+    if not torch.compiler.is_compiling():
+        if not rows.any():
+            return others
+        # Models are given one batch dimension, whatever the planner has.
+        if chunk is None and rows.ndim == 1 and rows.all():
+            made = replan(observation, bare)
+            return Plan(*(new.to(old.dtype) for new, old in zip(made, others, strict=True)))
+    count = len(bare)
+
+    def flat(*tensors: Tensor) -> Plan:
+        return replan(Observation.of(tensors[count:]), Plan(*tensors[:count]))
+
+    return Plan(*apply_to_rows(flat, rows, (*bare, *observation.flat()), others, chunk=chunk))

@@ -1,0 +1,233 @@
+"""Whole planners in a folder: their parts as JSON, their networks as safetensors, a card to read, nothing pickled."""
+
+from __future__ import annotations
+
+import dataclasses
+import importlib
+import json
+import math
+import sys
+from collections.abc import Callable, Mapping
+from pathlib import Path
+from typing import Any, Protocol, Self, runtime_checkable
+
+import torch
+from torch import Tensor
+
+from torchdyn_plan.checks import check_choice, check_writable_folder
+from torchdyn_plan.errors import InputError, WeightsError
+from torchdyn_plan.files import write_json, write_whole
+from torchdyn_plan.nets.pretrained import SHIPPED, Pretrained
+from torchdyn_plan.versions import library_versions
+
+FORMAT = "torchdyn_plan.planner.1"
+FILE = "planner.json"
+OWN = "torchdyn_plan."
+"""Classes of modules whose names begin so may be made from a file; others only where the program has imported them."""
+
+
+@runtime_checkable
+class HasSettings(Protocol):
+    """A part that tells the arguments which make the same part; a frozen dataclass tells them by its fields."""
+
+    def part_settings(self) -> dict[str, Any]:
+        """Names and values of the arguments of its constructor."""
+        ...
+
+
+class PretrainedPlanner:
+    """Adds `save_pretrained` and `from_pretrained` to a planner that is made of parts."""
+
+    def save_pretrained(self, folder: str | Path) -> Path:
+        """Write the planner into ``folder``: ``planner.json``, a ``.safetensors`` for each network, and a card.
+
+        A part that is a person's own function cannot be written: who loads the planner has to give it again.
+
+        Returns:
+            The JSON file. Raises `OutputError` where it cannot be written.
+        """
+        folder = check_writable_folder(Path(folder))
+        written: dict[int, str] = {}
+
+        def save(network: Pretrained) -> str:
+            if id(network) not in written:
+                count = sum(name.startswith(network.kind) for name in written.values())
+                written[id(network)] = f"{network.kind}{count + 1 if count else ''}.safetensors"
+                network.save_pretrained(folder / written[id(network)])
+            return written[id(network)]
+
+        content = describe_planner(self, save)
+        write_json(folder / FILE, content)
+        write_whole(folder / "planner.md", lambda file: file.write_text(_card(content)))
+        return folder / FILE
+
+    @classmethod
+    def from_pretrained(
+        cls, name_or_folder: str | Path, *, device: torch.device | str | None = None, **parts: Any
+    ) -> Self:
+        """The planner of a name that ships, ``"TASK-STATIC"`` for the paper's, or in a folder of `save_pretrained`.
+
+        Args:
+            name_or_folder: the name or the folder.
+            device: where its networks go.
+            parts: to take in place of those in the file, by the names of the constructor's arguments.
+
+        Raises:
+            InputError: there is no such planner, and the message lists those that ship; or a part that was given is of
+                no use.
+            WeightsError: the file is damaged, holds another planner, or lacks a part that was not given.
+        """
+        file = _find(name_or_folder)
+        content = _read(file)
+        if content.get("class") != _path_of(cls):
+            raise WeightsError(f"{str(file)!r} holds {content.get('class')}, expected {_path_of(cls)}")
+        described = content["parts"]
+        for name in parts:
+            check_choice("part", name, described)
+        load = _Loader(file)
+        made = {name: parts[name] if name in parts else load.part(name, value) for name, value in described.items()}
+        try:
+            planner: Any = cls(**made)
+        except (TypeError, InputError) as error:
+            if isinstance(error, InputError) and parts:
+                raise
+            raise WeightsError(f"{str(file)!r} describes no planner that can be made: {error}") from error
+        return _ready(planner.to(device), parts)
+
+
+def _ready(planner: Any, given: Mapping[str, Any]) -> Any:
+    """``planner``, to run and not to train, but for its parts that were ``given``: those are left as they are."""
+    planner.training = False
+    for name, module in planner.named_children():
+        if name not in given:
+            module.eval().requires_grad_(False)
+    return planner
+
+
+def describe_planner(planner: Any, save: Callable[[Pretrained], str]) -> dict[str, Any]:
+    """``planner`` as JSON; ``save`` stores a network and returns the name of its file."""
+    parts = {name: _describe(value, save) for name, value in planner.part_settings().items()}
+    return {"format": FORMAT, "class": _path_of(type(planner)), "parts": parts}
+
+
+def _describe(value: Any, save: Callable[[Pretrained], str]) -> Any:
+    """A part, or a setting of one, as JSON."""
+    if isinstance(value, (tuple, list)):
+        return [_describe(entry, save) for entry in value]
+    if isinstance(value, Pretrained):
+        return {"network": _path_of(type(value)), "file": save(value)}
+    if value is None or isinstance(value, (bool, int, float, str, torch.dtype, Tensor)):
+        return _describe_value(value)
+    settings = _settings_of(value)
+    if settings is None:
+        return {"missing": type(value).__name__}
+    return {"part": _path_of(type(value)), "settings": {name: _describe(one, save) for name, one in settings.items()}}
+
+
+def _describe_value(value: Any) -> Any:
+    """A number, a word or a tensor as JSON, which knows no infinity and no types of torch."""
+    if isinstance(value, Tensor):
+        return {"tensor": value.detach().cpu().tolist(), "dtype": str(value.dtype).removeprefix("torch.")}
+    if isinstance(value, torch.dtype):
+        return {"dtype": str(value).removeprefix("torch.")}
+    if isinstance(value, float) and not math.isfinite(value):
+        return {"number": str(value)}
+    return value
+
+
+def _settings_of(value: Any) -> dict[str, Any] | None:
+    """Arguments that make the same part; None if it does not tell them."""
+    if isinstance(value, HasSettings):
+        return value.part_settings()
+    if dataclasses.is_dataclass(value):
+        return {one.name: getattr(value, one.name) for one in dataclasses.fields(value) if one.init}
+    return None
+
+
+class _Loader:
+    """Makes parts from what a planner's file says of them."""
+
+    def __init__(self, file: Path) -> None:
+        self.file = file
+
+    def part(self, name: str, value: Any) -> Any:
+        """The part ``name``; raises `WeightsError` where it cannot be made."""
+        try:
+            return self.restore(value)
+        except (KeyError, TypeError, ValueError, AttributeError, ImportError) as error:
+            if isinstance(error, WeightsError):
+                raise WeightsError(f"{name} of {str(self.file)!r}: {error}") from error
+            raise WeightsError(f"{name} of {str(self.file)!r} cannot be made: {error!r}") from error
+
+    def restore(self, value: Any) -> Any:
+        """What `_describe` described."""
+        if isinstance(value, list):
+            return tuple(self.restore(entry) for entry in value)
+        if not isinstance(value, Mapping):
+            return value
+        if "missing" in value:
+            raise WeightsError(f"it is a {value['missing']}, which no file can hold: give it to from_pretrained")
+        if "network" in value:
+            return _class_at(value["network"], Pretrained).from_pretrained(self.file.parent / value["file"])
+        if "part" in value:
+            settings = {name: self.restore(one) for name, one in value["settings"].items()}
+            return _class_at(value["part"], None)(**settings)
+        return _restore_value(value)
+
+
+def _restore_value(value: Mapping[str, Any]) -> Any:
+    """What `_describe_value` described."""
+    if "number" in value:
+        return float(value["number"])
+    dtype = getattr(torch, value["dtype"])
+    if not isinstance(dtype, torch.dtype):
+        raise WeightsError(f"torch.{value['dtype']} is no type of numbers")
+    return torch.tensor(value["tensor"], dtype=dtype) if "tensor" in value else dtype
+
+
+def _class_at(path: str, base: type | None) -> Any:
+    """The class at ``module:Name``, which must be a part or a subclass of ``base``; nothing foreign is imported."""
+    module, _, name = path.partition(":")
+    if not module.startswith(OWN) and module not in sys.modules:
+        raise WeightsError(f"it is a {path}, of a module that is not imported: import {module} first")
+    found = getattr(importlib.import_module(module), name)
+    is_part = isinstance(found, type) and (dataclasses.is_dataclass(found) or hasattr(found, "part_settings"))
+    if not (is_part if base is None else isinstance(found, type) and issubclass(found, base)):
+        raise WeightsError(f"{path} is no part of a planner")
+    return found
+
+
+def _path_of(kind: type) -> str:
+    return f"{kind.__module__}:{kind.__qualname__}"
+
+
+def _find(name_or_folder: str | Path) -> Path:
+    choices = (Path(name_or_folder) / FILE, SHIPPED / f"planner-{name_or_folder}.json")
+    for choice in choices:
+        if choice.is_file():
+            return choice
+    shipped = [file.stem.removeprefix("planner-") for file in SHIPPED.glob("planner-*.json")]
+    if Path(name_or_folder).is_dir():
+        raise InputError(f"folder {str(name_or_folder)!r} holds no planner: no {FILE}, as save_pretrained writes it")
+    check_choice("planner", str(name_or_folder), shipped)
+    raise AssertionError("a planner that ships was not found")
+
+
+def _read(file: Path) -> dict[str, Any]:
+    try:
+        content = json.loads(file.read_text())
+        if content["format"] != FORMAT or not isinstance(content["parts"], dict):
+            raise KeyError("format")
+    except (OSError, ValueError, KeyError, TypeError) as error:
+        raise WeightsError(f"{str(file)!r} describes no planner of this package: {error!r}") from error
+    return content
+
+
+def _card(content: Mapping[str, Any]) -> str:
+    """What a person wants to know of a planner in a folder, as Markdown."""
+    lines = ["# Planner", "", f"- class: {content['class']}"]
+    for name, value in content["parts"].items():
+        known = value if not isinstance(value, Mapping) else value.get("part") or value.get("network") or "not saved"
+        lines.append(f"- {name}: {known}")
+    versions = ", ".join(f"{name} {version}" for name, version in library_versions().items() if version)
+    return "\n".join([*lines, f"- versions: {versions}", "", f"Every setting is in `{FILE}`.", ""])

@@ -1,0 +1,66 @@
+"""What a goal search is given, and what it finds."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, NamedTuple, Protocol
+
+from torch import Tensor
+
+if TYPE_CHECKING:
+    from torchdyn_plan.nets.arrival import ArrivalQuery
+    from torchdyn_plan.nets.distributions import Arrival
+    from torchdyn_plan.nets.forecast import Forecast
+    from torchdyn_plan.planners.plan import Lost
+
+
+class Meeting(NamedTuple):
+    """Where and when robot and target meet."""
+
+    goal: Tensor
+    """``(*B, 3)`` [m, world]: where they meet."""
+    arrival_steps: Tensor
+    """``(*B,)`` int64: control steps from now to the meeting, at most the horizon."""
+    clamped: Tensor
+    """``(*B,)`` bool: an arrival that decided the goal lay beyond the horizon and was cut to it."""
+    reachable: Tensor
+    """``(*B,)`` bool: false where the robot never arrives at any candidate, and the goal is only a direction."""
+
+
+class SearchContext(NamedTuple):
+    """What a search may want to know beside forecast and arrival; each is None where nobody knows it."""
+
+    tool_pos: Tensor | None = None
+    """``(*B, 3)`` [m, world], to tell goals that are reached already."""
+    planned_steps: Tensor | None = None
+    """``(*B,)`` control steps from now to the meeting that was planned before."""
+    lost: Lost | None = None
+    """When a target is lost."""
+
+
+NO_CONTEXT = SearchContext()
+
+
+class GoalSearch(Protocol):
+    """A strategy that chooses where and when robot and target meet."""
+
+    def __call__(
+        self, forecast: Forecast, target_pos: Tensor, eta: ArrivalQuery, context: SearchContext = NO_CONTEXT, /
+    ) -> Meeting:
+        """Choose a meeting.
+
+        Args:
+            forecast: of the target, ``(*B, F, 3)`` [m, world].
+            target_pos: ``(*B, 3)`` [m, world], the target now.
+            eta: maps goals (*B, K, 3) to arrivals (*B, K).
+            context: what else is known.
+        """
+        ...
+
+
+def later(eta: ArrivalQuery, steps: int) -> ArrivalQuery:
+    """``eta`` counted from ``steps`` control steps later."""
+
+    def query(goal: Tensor, *, estimator: str = "mode") -> Arrival:
+        return eta(goal, estimator=estimator).after(steps)
+
+    return query

@@ -1,0 +1,1 @@
+"""Planners for a static goal."""

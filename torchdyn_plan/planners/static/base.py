@@ -1,0 +1,14 @@
+"""What the static planners of this package share."""
+
+from __future__ import annotations
+
+from typing import ClassVar
+
+from torchdyn_plan.planners.memory import Remembering
+
+
+class StaticPlannerModule(Remembering):
+    """A planner for a static goal that reads and writes tensordicts, as `StaticPlanner` says."""
+
+    comes_to_rest: ClassVar[bool] = True
+    """Whether the robot comes to rest where it cannot get nearer to its goal."""

@@ -1,0 +1,205 @@
+"""The static planner by inverse kinematics: damped least squares, five steps of the path at a time."""
+
+from __future__ import annotations
+
+import functools
+import math
+from typing import Any, NamedTuple, cast
+
+import torch
+from tensordict import TensorDictBase
+from torch import Tensor, nn
+
+from torchdyn_plan import keys
+from torchdyn_plan.checks import check_finite, check_number, check_trailing_shape
+from torchdyn_plan.errors import InputError
+from torchdyn_plan.kinematics.arm import Arm
+from torchdyn_plan.kinematics.components import Vector, damped_least_squares
+from torchdyn_plan.kinematics.dls import dls_step, limited_step
+from torchdyn_plan.kinematics.fused import Columns, Fused, filled
+from torchdyn_plan.planners.memory import remember, warn_of_loss
+from torchdyn_plan.planners.protocol import read
+from torchdyn_plan.planners.static.approach import Approach, StraightToGoal
+from torchdyn_plan.planners.static.base import StaticPlannerModule
+
+
+class Path(NamedTuple):
+    """Where each arm's path stands; its names below ``plan`` begin with ``path_``."""
+
+    pos: Tensor
+    """``(*B, N)`` joint angles to which it has come [rad]."""
+    step: Tensor
+    """``(*B,)`` int64 steps of it that are made."""
+    goal: Tensor
+    """``(*B, 3)`` where it leads [m, world]."""
+
+
+PATH_NAMES = tuple(f"path_{field}" for field in Path._fields)
+
+
+class IKPlanner(StaticPlannerModule):
+    """Drives an arm's tool to ``goal`` by inverse kinematics, in the way that its approach says.
+
+    Reads ``joint_pos`` (*B, N) [rad], ``goal`` (*B, 3) [m, world] and ``step_count`` (*B,); writes ``action`` (*B, N)
+    and its memory under ``plan``. The arm follows a path of `PATH_LENGTH` steps from where it was when the path began,
+    whatever it does meanwhile; the path is flushed when the goal changes (paper, Section III-B.1), and rows with
+    ``step_count`` 0 start afresh. A control step solves that step of the path alone: a flushed path costs nothing.
+    """
+
+    PATH_LENGTH = 5
+    _limit: Tensor
+
+    def __init__(
+        self,
+        arm: Arm,
+        *,
+        approach: Approach | None = None,
+        control_step: float = 0.004,
+        damping: float = 0.02,
+        gain: float = 0.25,
+        chunk: int | None = None,
+        compiled: bool = False,
+    ) -> None:
+        """Plan for ``arm`` at ``control_step`` [s].
+
+        Args:
+            arm: whose tool frame is brought to the goal.
+            approach: how the tool comes to a goal; straight, from a base at the world's origin, by default.
+            control_step: time between two actions [s].
+            damping: λ of the least squares.
+            gain: share of the remaining joint error that one step may cover, which brakes the arm at the end.
+            chunk: solve in blocks of exactly this many rows, so that results do not depend on the batch size.
+            compiled: solve in one compiled loop, which takes a C++ compiler and some seconds at the first call (less
+                where torch finds it in its cache); actions are the same but for rounding, do not depend on the batch
+                size, and have no derivatives.
+        """
+        super().__init__()
+        if not isinstance(arm, Arm):
+            raise InputError(f"arm must be an Arm, as from Arm.from_urdf or Arm.ur5, got {type(arm).__name__}")
+        if chunk is not None:
+            check_number("chunk", chunk, minimum=1, integer=True)
+        remembered: list[Any] = [(keys.PLAN, name) for name in PATH_NAMES]
+        self.in_keys = [keys.JOINT_POS, keys.GOAL, keys.STEP_COUNT, *remembered]
+        self.out_keys = [keys.ACTION, *remembered]
+        self.arm, self.approach = arm, approach or StraightToGoal()
+        self.control_step, self.damping, self.gain, self.chunk = control_step, damping, gain, chunk
+        self.compiled = compiled
+        self._fused = Fused(self._fused_step) if compiled else None
+        self.register_buffer("_limit", self.arm.speed_limit * control_step, False)
+
+    def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
+        """Write ``action`` for the ``goal`` in ``tensordict``, on a new path where the old one is used up or stale.
+
+        Raises:
+            InputError: a key is missing, a shape is wrong, or the goal holds a NaN or an infinity.
+        """
+        wanted = keys.JOINT_POS, keys.GOAL, keys.STEP_COUNT
+        values: list[Any] = [tensordict.get(key, None) for key in wanted]
+        if any(value is None for value in values):
+            values = [read(tensordict, key, "IKPlanner") for key in wanted]
+        joint_pos, goal, step_count = values
+        if not torch.compiler.is_compiling():
+            fits = joint_pos.shape[-1:] == self._limit.shape and goal.shape == (*joint_pos.shape[:-1], 3)
+            if not (fits and math.isfinite(goal.sum().item())):
+                self._check(joint_pos, goal)
+        path_pos, path_step = self._recall(tensordict.get(keys.PLAN, None), joint_pos, goal, step_count)
+        blocks = self.chunk is not None and self._fused is None
+        action, path_pos = self._step_blocks(path_pos, goal) if blocks else self.step(path_pos, goal)
+        tensordict.set(keys.ACTION, action.to(joint_pos.dtype))
+        path = Path(path_pos.to(joint_pos.dtype), path_step + 1, goal)
+        remember(tensordict, dict(zip(PATH_NAMES, path, strict=True)))
+        return tensordict
+
+    def empty_memory(self, like: Tensor) -> dict[str, Tensor]:
+        """The entries of a path that is used up, as `Remembering` says."""
+        batch = like.shape[:-1]
+        step = torch.full(batch, self.PATH_LENGTH, dtype=torch.int64, device=like.device)
+        path = Path(like.new_zeros(*batch, self.arm.num_joints), step, torch.zeros_like(like))
+        return dict(zip(PATH_NAMES, path, strict=True))
+
+    def part_settings(self) -> dict[str, Any]:
+        """Arguments that make the same planner."""
+        names = ("arm", "approach", "control_step", "damping", "gain", "chunk", "compiled")
+        return {name: getattr(self, name) for name in names}
+
+    def _recall(self, plan: Any, joint_pos: Tensor, goal: Tensor, step_count: Tensor) -> tuple[Tensor, Tensor]:
+        """Where the path stands, (*B, N) and its step (*B,); where ``plan`` holds none to follow, a new path begins."""
+        stored: dict[str, Any] = {} if plan is None else dict(plan.items())
+        if any(name not in stored for name in PATH_NAMES):
+            warn_of_loss(PATH_NAMES[0], step_count == 0)
+            return joint_pos, torch.zeros(joint_pos.shape[:-1], dtype=torch.int64, device=joint_pos.device)
+        path = Path(*(stored[name] for name in PATH_NAMES))
+        ends = (path.step >= self.PATH_LENGTH) | (path.goal != goal).any(-1)
+        ends |= step_count.reshape(ends.shape) == 0
+        return torch.where(ends.unsqueeze(-1), joint_pos, path.pos), path.step.masked_fill(ends, 0)
+
+    def _step_blocks(self, joint_pos: Tensor, goal: Tensor) -> tuple[Tensor, Tensor]:
+        """`step`, in blocks of ``chunk`` rows, of which the last is filled up."""
+        assert self.chunk is not None
+        batch, padding = joint_pos.shape, (0, 0, 0, -joint_pos.shape[:-1].numel() % self.chunk)
+        rows = [nn.functional.pad(value.reshape(-1, value.shape[-1]), padding) for value in (joint_pos, goal)]
+        action, reached = self.step(*rows)
+        count = batch[:-1].numel()
+        return action[:count].reshape(batch), reached[:count].reshape(batch)
+
+    def _check(self, joint_pos: Tensor, goal: Tensor) -> None:
+        check_trailing_shape(keys.JOINT_POS, joint_pos, self.arm.num_joints)
+        check_trailing_shape(keys.GOAL, goal, *joint_pos.shape[:-1], 3)
+        check_finite(keys.GOAL, goal)
+
+    def path(self, joint_pos: Tensor, goal: Tensor) -> Tensor:
+        """Next `PATH_LENGTH` actions from ``joint_pos`` (*B, N) towards ``goal`` (*B, 3) [m, world]: (*B, 5, N)."""
+        actions = []
+        for _ in range(self.PATH_LENGTH):
+            action, joint_pos = self.step(joint_pos, goal)
+            actions.append(action)
+        return torch.stack(actions, dim=-2)
+
+    def step(self, joint_pos: Tensor, goal: Tensor) -> tuple[Tensor, Tensor]:
+        """One step of the path from ``joint_pos`` (*B, N) [rad] towards ``goal`` (*B, 3) [m, world].
+
+        Returns:
+            The action ``(*B, N)`` and the joint angles to which the path has come ``(*B, N)`` [rad].
+        """
+        joint_pos, goal = joint_pos.to(self._limit.dtype), goal.to(self._limit.dtype)
+        if self._fused is not None:
+            if joint_pos.ndim == 2:
+                action, reached = self._fused(joint_pos, goal)
+                return action, reached
+            rows = self._fused(joint_pos.reshape(-1, joint_pos.shape[-1]), goal.reshape(-1, 3))
+            action, reached = (value.reshape(joint_pos.shape) for value in rows)
+            return action, reached
+        if joint_pos.ndim == 2 and (self.chunk is None or len(joint_pos) <= self.chunk):
+            pose, jacobian = self.arm.form.pose_and_jacobian(joint_pos)
+        else:
+            pose, jacobian = self._pose_and_jacobian(joint_pos)
+        error = torch.stack(self.approach.twist(pose.flatten(-2).unbind(-1), goal.unbind(-1)), dim=-1)
+        rows = jacobian if error.shape[-1] == 6 else jacobian[..., : error.shape[-1], :]
+        # A module's attribute that is a buffer takes as long to look up as a small operation; its table does not.
+        limit, bounds = cast(Tensor, self._buffers["_limit"]), cast(dict[str, Tensor], self.arm._buffers)
+        step = limited_step(dls_step(rows, error, self.damping), limit, self.gain)
+        step = torch.clamp(step, bounds["lower"] - joint_pos, bounds["upper"] - joint_pos)
+        return (step / limit).clamp(-1.0, 1.0), joint_pos + step
+
+    def _fused_step(self, joint_pos: Columns, goal: Columns) -> tuple[Vector, Vector]:
+        """`step`, column by column."""
+        rotation, place, jacobian = self.arm.components(joint_pos)
+        pose = [entry for row, end in zip(rotation, place, strict=True) for entry in (*row, end)]
+        error = self.approach.twist([filled(entry, joint_pos[0]) for entry in pose], goal)
+        columns = [column[: len(error)] for column in jacobian]
+        step = [filled(value, goal[0]) for value in damped_least_squares(columns, error, self.damping)]
+        limit, lower, upper = (values.tolist() for values in (self._limit, self.arm.lower, self.arm.upper))
+        worst = functools.reduce(torch.maximum, [value.abs() / most for value, most in zip(step, limit, strict=True)])
+        share = (1.0 / worst.clamp_min(1e-12)).clamp(max=self.gain)
+        bounds = zip(joint_pos, lower, upper, strict=True)
+        ways = [(low - here, high - here) for here, low, high in bounds]
+        step = [torch.clamp(value * share, *way) for value, way in zip(step, ways, strict=True)]
+        action = [(value / most).clamp(-1.0, 1.0) for value, most in zip(step, limit, strict=True)]
+        return action, [here + value for here, value in zip(joint_pos, step, strict=True)]
+
+    def _pose_and_jacobian(self, joint_pos: Tensor) -> tuple[Tensor, Tensor]:
+        """The arm's, from products of always ``chunk`` rows where ``joint_pos`` is a multiple of them."""
+        if self.chunk is None or joint_pos.ndim != 2:
+            return self.arm.pose_and_jacobian(joint_pos)
+        pose, jacobian = zip(*map(self.arm.pose_and_jacobian, joint_pos.split(self.chunk)), strict=True)
+        return torch.cat(pose), torch.cat(jacobian)

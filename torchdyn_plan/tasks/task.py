@@ -1,0 +1,336 @@
+"""A task in one frozen object: what differs from task to task, so that everything else can be written once.
+
+Nothing heavy is imported here or in the modules that define tasks: what a task needs is imported where it is used, so
+that the command line can ask a task for its options at once.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import importlib
+import importlib.metadata
+import importlib.util
+import pkgutil
+import sys
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, NamedTuple, Protocol
+
+from torchdyn_plan.errors import InputError
+
+if TYPE_CHECKING:
+    from torch import Tensor
+
+    from torchdyn_plan.envs.moving_target import MovingTargetEnv
+
+ENTRY_POINTS = "torchdyn_plan.tasks"
+"""Group of entry points in which other packages name their tasks, ``name = "package.module:NAME"``."""
+
+
+def setting(
+    default: Any,
+    *,
+    text: str,
+    unit: str = "",
+    minimum: float | None = None,
+    maximum: float | None = None,
+    choices: Sequence[Any] = (),
+    sweep: Sequence[float] = (),
+) -> Any:
+    """A field of a task's settings.
+
+    Args:
+        default: value that is taken when none is given.
+        text: one line for ``--help``, without the unit.
+        unit: of the value.
+        minimum: least value allowed; None for any.
+        maximum: greatest value allowed; None for any.
+        choices: the only values allowed; empty for any.
+        sweep: values of a sweep over this setting; empty for a setting that is not swept.
+    """
+    about = {"text": text, "unit": unit, "minimum": minimum, "maximum": maximum}
+    return field(default=default, metadata=about | {"choices": tuple(choices), "sweep": tuple(sweep)})
+
+
+@dataclass(frozen=True, kw_only=True)
+class Settings:
+    """What varies from run to run of a task, beside its episodes; a task's own are a frozen subclass, by `setting`."""
+
+    def __post_init__(self) -> None:
+        from torchdyn_plan.checks import check_choice, check_number
+
+        for one in dataclasses.fields(self):
+            value, about = getattr(self, one.name), one.metadata
+            if about.get("choices"):
+                check_choice(one.name, value, about["choices"])
+            elif isinstance(value, (int, float)) and not isinstance(value, bool):
+                bounds = {name: about[name] for name in ("minimum", "maximum") if about.get(name) is not None}
+                check_number(one.name, value, **bounds)
+
+
+class Words(NamedTuple):
+    """How a task speaks of its outcomes; files and tables use these words."""
+
+    success: str
+    """Flag of the environment that tells success, as ``trapped``."""
+    steps: str
+    """How its duration is called, as ``steps to trap``."""
+    target: str = "target"
+    """What moves, as ``ball``."""
+
+
+class Truth(NamedTuple):
+    """What is known of E episodes before a planner plays them."""
+
+    future: Tensor
+    """``(E, T, 3)`` positions of the targets at steps 0 … T-1, had no robot touched them [m, world]."""
+    solvable: Tensor
+    """``(E,)`` bool: episodes that can be solved at all, by the task's notion of it."""
+
+
+class Verdict(NamedTuple):
+    """What a task says of E episodes that were played, ``(E,)`` each."""
+
+    cause: Tensor
+    """int64 index into `Task.causes` of what each failed of; -1 for a success."""
+    flags: Mapping[str, Tensor]
+    """Further outcomes, bool, by name."""
+    evidence: Mapping[str, Tensor]
+    """What the causes follow from, by name."""
+
+
+class PaperCurves(Protocol):
+    """Success rates that a paper reports for a task, to stand beside ours."""
+
+    def rate(self, planner: str, static: str, settings: Any, *, solvable: bool) -> float | None:
+        """The paper's success rate at these settings, over all or over solvable episodes; None where it has none."""
+        ...
+
+    def curve(
+        self, planner: str, static: str, over: str, settings: Any, *, solvable: bool
+    ) -> tuple[list[float], list[float]] | None:
+        """The paper's curve over the setting ``over``, the others as in ``settings``: abscissae and success rates."""
+        ...
+
+
+@dataclass(frozen=True, kw_only=True)
+class PolicyTraining:
+    """How a policy of a task is trained by trial."""
+
+    summary: str
+    """One line for ``--help``."""
+    options: type[Any]
+    """Frozen dataclass of its own options, each with a line of text under it; all have defaults."""
+    goal_task: Callable[..., Any]
+    """Makes the `torchdyn_plan.training.goal_task.GoalTask` from those options and ``num_threads``."""
+    recipe: Callable[[], Any]
+    """Makes the `torchdyn_plan.training.goal_task.DDPGRecipe` that is taken when nothing else is asked for."""
+    score_every: int = 20
+    """Rounds from one score to the next."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Task:
+    """A robot, a moving target, and what it means to meet it.
+
+    Every callable imports what it needs when it is called. ``settings`` below is an instance of the task's settings.
+    """
+
+    name: str
+    """As on the command line, and in the names of weights."""
+    summary: str
+    """One line for ``--help``."""
+    settings: type[Settings]
+    """What varies from run to run."""
+    words: Words
+    """How it speaks of its outcomes."""
+    max_steps: int
+    """Control steps of an episode at most."""
+    control_step: float
+    """Time between two actions [s]."""
+    make_env: Callable[..., MovingTargetEnv]
+    """``(settings, *, num_envs, seed, split, num_threads)`` to the environment."""
+    digest: Callable[[], str]
+    """Hash of the scene: what data, weights and planners belong to."""
+    static_planners: Mapping[str, Callable[..., Any]]
+    """Makers of static planners by name, ``(*, chunk, weights)``: rows that it sees at once, None for all of them at a
+    time, and file or folder of a policy's weights, None for those that ship. The first is taken when none is named."""
+    planners: Mapping[str, Callable[[PlannerParts], Any]]
+    """Makers of planners for the moving target by name, from the parts that they may need."""
+    rivals: tuple[str, ...] = ()
+    """Planners that run only when they are named."""
+    rows_at_once: tuple[int, int] = (32, 64)
+    """Rows that networks and static planners see at once in an evaluation, so that its results do not depend on how
+    many environments run side by side."""
+    truth: Callable[..., Truth] | None = None
+    """``(settings, *, episodes, seed, split, static, num_threads)`` to what is known beforehand of episodes 0 … E-1,
+    with the static planner of that name; None if nothing is: then all episodes count as solvable."""
+    causes: tuple[str, ...] = ()
+    """Names of the causes of failure, in the order in which they are asked."""
+    judge: Callable[..., Verdict] | None = None
+    """``(settings, log, truth)``, with the `torchdyn_plan.evaluation.episodes.EpisodeLog`, to why episodes failed."""
+    record_paths: Callable[..., dict[str, Tensor]] | None = None
+    """``(blocks, *, seed, num_threads)`` to the paths of targets that nobody touches, of the episodes in ``blocks``
+    (tensors of their numbers), laid end to end: ``positions start length pocketed velocity``."""
+    record_arrivals: Callable[..., dict[str, Tensor]] | None = None
+    """``(planner, *, num_envs, sequences, seed, num_threads)`` to runs of a static planner: ``robot_state goal arrival
+    run``; None if no arrival model is trained."""
+    fitting: Callable[[], Any] | None = None
+    """Makes the `torchdyn_plan.training.fitting.Fitting`: sizes of networks, and how they are scored."""
+    policies: Mapping[str, PolicyTraining] = field(default_factory=dict)
+    """Policies that can be trained, by the name of their weights."""
+    paper: Callable[[], PaperCurves] | None = None
+    """Makes the curves of the paper; None if no paper has any."""
+
+    @property
+    def default_static(self) -> str:
+        """Name of the static planner that is taken when none is named."""
+        return next(iter(self.static_planners))
+
+    @property
+    def default_planners(self) -> tuple[str, ...]:
+        """Planners that run when none are named."""
+        return tuple(name for name in self.planners if name not in self.rivals)
+
+    def static_planner(self, name: str | None = None, *, chunk: int | None = None, weights: Any = None) -> Any:
+        """The static planner of that name, the default one for None; raises `InputError`, or `WeightsError`."""
+        from torchdyn_plan.checks import check_choice
+
+        name = name or self.default_static
+        check_choice(f"static planner of {self.name}", name, self.static_planners)
+        return self.static_planners[name](chunk=chunk, weights=weights)
+
+    def planner(
+        self,
+        name: str,
+        static: str | None = None,
+        *,
+        weights: str | Path | None = None,
+        chunk: int | None = None,
+        static_chunk: int | None = None,
+    ) -> Any:
+        """A planner for the moving target.
+
+        Args:
+            name: one of `planners`.
+            static: name of its static planner; the default one for None.
+            weights: folder of its networks, as ``train`` leaves it; those that ship for None.
+            chunk: rows that its networks see at once, so that results do not depend on the batch size.
+            static_chunk: rows that its static planner sees at once.
+
+        Raises:
+            InputError: the task has no such planner; the message lists those it has.
+            WeightsError: weights are missing or damaged.
+        """
+        from torchdyn_plan.checks import check_choice
+
+        check_choice(f"planner of {self.name}", name, self.planners)
+        static = static or self.default_static
+        check_choice(f"static planner of {self.name}", static, self.static_planners)
+        folder = None if weights is None else Path(weights)
+        return self.planners[name](PlannerParts(self, static, folder, chunk, static_chunk))
+
+    def default_settings(self, **changes: Any) -> Settings:
+        """The task's settings with some of them changed; raises `InputError` for an unknown name or a bad value."""
+        from torchdyn_plan.checks import check_choice
+
+        for name in changes:
+            check_choice(f"setting of {self.name}", name, [one.name for one in dataclasses.fields(self.settings)])
+        return self.settings(**changes)
+
+
+@dataclass(frozen=True)
+class PlannerParts:
+    """What a task's planners are made of; networks are loaded when they are asked for."""
+
+    task: Task
+    static_name: str
+    weights: Path | None = None
+    """Folder of the networks; None for those that ship."""
+    chunk: int | None = None
+    static_chunk: int | None = None
+
+    @property
+    def static(self) -> Any:
+        """The static planner."""
+        return self.task.static_planner(self.static_name, chunk=self.static_chunk)
+
+    @property
+    def forecaster(self) -> Any:
+        """The `Forecaster`, frozen."""
+        from torchdyn_plan.nets import Forecaster
+
+        return self._load(Forecaster, self.task.name)
+
+    @property
+    def spread_forecaster(self) -> Any:
+        """The `Forecaster` with its `SpreadNetwork`, frozen."""
+        from torchdyn_plan.nets import SpreadForecaster, SpreadNetwork
+
+        return SpreadForecaster(self.forecaster, self._load(SpreadNetwork, self.task.name)).eval()
+
+    @property
+    def eta(self) -> Any:
+        """The `ETANetwork` of the static planner, frozen."""
+        from torchdyn_plan.nets import ETANetwork
+
+        return self._load(ETANetwork, f"{self.task.name}-{self.static_name}")
+
+    def _load(self, kind: Any, name: str) -> Any:
+        return kind.from_pretrained(name if self.weights is None else self.weights).requires_grad_(False)
+
+
+_registered: dict[str, Task] = {}
+
+
+def register(task: Task) -> Task:
+    """Make ``task`` known by its name in this process; returns it. The last one of a name counts."""
+    _registered[task.name] = task
+    return task
+
+
+def task_names() -> list[str]:
+    """Names of the tasks that are registered, ship with the package, or are named by other packages' entry points."""
+    package = importlib.import_module("torchdyn_plan.tasks")
+    shipped = [module.name for module in pkgutil.iter_modules(package.__path__) if module.ispkg]
+    others = [point.name for point in importlib.metadata.entry_points(group=ENTRY_POINTS)]
+    return sorted({*_registered, *shipped, *others})
+
+
+def load_task(name: str | Task) -> Task:
+    """The task of that name, or at ``package.module:NAME`` if it is nowhere registered; a `Task` is returned as it is.
+
+    Raises:
+        InputError: there is no such task; the message lists those there are.
+    """
+    if isinstance(name, Task):
+        return name
+    if name in _registered:
+        return _registered[name]
+    if ":" in name:
+        return _import_task(name)
+    for point in importlib.metadata.entry_points(group=ENTRY_POINTS):
+        if point.name == name:
+            return _import_task(point.value)
+    if name in task_names():
+        return _import_task(f"torchdyn_plan.tasks.{name}:TASK")
+    from difflib import get_close_matches
+
+    near = get_close_matches(name, task_names(), n=1)
+    hint = f" (did you mean {near[0]!r}?)" if near else ""
+    raise InputError(f"unknown task {name!r}{hint}; choose from {', '.join(task_names())}, or give package.module:NAME")
+
+
+def _import_task(place: str) -> Task:
+    """The task at ``package.module:NAME``; the working folder is looked at, too."""
+    module, _, attribute = place.partition(":")
+    if str(Path.cwd()) not in sys.path and "" not in sys.path:
+        sys.path.append(str(Path.cwd()))
+    try:
+        found = getattr(importlib.import_module(module), attribute)
+    except (ImportError, AttributeError, ValueError) as error:
+        raise InputError(f"no task at {place!r}: {error}") from error
+    if not isinstance(found, Task):
+        raise InputError(f"{place!r} is no Task, but {type(found).__name__}")
+    return found

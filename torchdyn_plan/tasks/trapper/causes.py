@@ -1,0 +1,61 @@
+"""What went wrong in an episode: one cause for each that failed, from what was recorded in it."""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor
+
+from torchdyn_plan.envs.trapper.scene import TrapperScene
+from torchdyn_plan.evaluation.episodes import EpisodeLog
+from torchdyn_plan.evaluation.results import NO_CAUSE
+from torchdyn_plan.tasks.task import Truth, Verdict
+from torchdyn_plan.tasks.trapper.evidence import Evidence, find_evidence
+from torchdyn_plan.tasks.trapper.task import TASK
+
+FORECAST_TOLERANCE = 0.04
+"""A ball that comes no nearer than this to the promised place about the promised time is elsewhere [m]."""
+ETA_TOLERANCE = 5
+"""An arm that comes later than promised by more than this is late: a bin of the arrival predictor [control steps]."""
+
+
+def judge_episodes(log: EpisodeLog, truth: Truth) -> Verdict:
+    """Why the episodes of ``log`` failed, what their records say of it, and whether the ball was ``touched``."""
+    scene, evidence = TrapperScene(), Evidence.none(len(log.done))
+    for episodes, trace in log.records():
+        for whole, part in zip(evidence, find_evidence(scene, trace, truth.future[episodes]), strict=True):
+            whole[episodes] = part
+    touched = evidence.contact_step >= 0
+    cause = failure_cause(log.success, truth.solvable, touched, log.flags["pocketed"], evidence)
+    return Verdict(cause, {"touched": touched}, evidence._asdict())
+
+
+def failure_cause(trapped: Tensor, solvable: Tensor, touched: Tensor, pocketed: Tensor, evidence: Evidence) -> Tensor:
+    """Index into the task's ``causes`` of the first cause that holds, or `NO_CAUSE` for a success; int64 ``(*B,)``.
+
+    - unreachable: not solvable, so nothing that the planner does can help.
+    - planner_too_slow: it made plans, but none promised a meeting that the arm could be in time for.
+    - forecast: the ball did not come to the promised place about the promised time (`FORECAST_TOLERANCE`).
+    - eta: the arm came to its goal later than promised, by more than `ETA_TOLERANCE`, or never.
+    - early_contact: the ball ran into a box that was down already, or rested where the box came down.
+    - pocketed: no meeting was promised, nothing was touched, and the ball fell into a pocket.
+    - late: all else. The box came down behind the ball or not at all, or time ran out.
+
+    Args:
+        trapped: ``(*B,)`` bool, the ball is covered and kept, whatever else happened.
+        solvable: ``(*B,)`` bool, the static planner could have been at some future place of the ball in time
+            (paper, Section IV-B).
+        touched: ``(*B,)`` bool, the ball met the outside of the box.
+        pocketed: ``(*B,)`` bool, the ball fell into a pocket.
+        evidence: ``(*B,)`` each.
+    """
+    holds = {
+        "unreachable": ~solvable,
+        "planner_too_slow": evidence.planned & ~evidence.promised,
+        "forecast": evidence.promised & (evidence.forecast_error > FORECAST_TOLERANCE),
+        "eta": evidence.promised & (evidence.eta_error > ETA_TOLERANCE),
+        "early_contact": touched & ~evidence.receding,
+        "pocketed": pocketed & ~touched & ~evidence.promised,
+        "late": torch.ones_like(trapped),
+    }
+    in_order = torch.stack([holds[cause] for cause in TASK.causes], dim=-1)
+    return torch.where(trapped, NO_CAUSE, in_order.to(torch.int64).argmax(dim=-1))

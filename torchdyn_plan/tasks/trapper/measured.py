@@ -1,0 +1,58 @@
+"""Arrival times by running the static planner: the truth that an ETA network predicts, at the price of a simulation."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import torch
+from tensordict import TensorDictBase
+from torch import Tensor
+
+from torchdyn_plan.checks import check_trailing_shape
+from torchdyn_plan.envs.trapper.arm_runner import TrapperArmRunner
+from torchdyn_plan.envs.trapper.scene import TrapperScene
+from torchdyn_plan.nets.arrival import Arrival, ArrivalModel
+
+LONGEST = 300
+"""Control steps after which an arm that has not arrived never does."""
+
+
+class MeasuredArrival(ArrivalModel):
+    """Stands in for an `ETANetwork` of Trapper and tells the truth: it drives copies of the arm to each goal."""
+
+    def __init__(
+        self,
+        static: Callable[[TensorDictBase], TensorDictBase],
+        *,
+        scene: TrapperScene | None = None,
+        num_threads: int = 0,
+    ) -> None:
+        """Measure arrivals of ``static`` in ``scene``."""
+        super().__init__()
+        self.static, self.scene, self.num_threads = static, scene or TrapperScene(), num_threads
+        self._arms: dict[int, TrapperArmRunner] = {}
+
+    def arrival(self, robot_state: Tensor, goal: Tensor, *, estimator: str = "mode") -> Arrival:
+        """Steps and *never* (*B, K) for robot states (*B, 1, 15) and goals (*B, K, 3) [m, world], by any estimator."""
+        check_trailing_shape("robot_state", robot_state, 15)
+        check_trailing_shape("goal", goal, 3)
+        batch = goal.shape[:-1]
+        state = robot_state.expand(*batch, 15).reshape(-1, 15)
+        steps = self._run(state, goal.reshape(-1, 3)).view(batch)
+        return Arrival(steps.clamp(max=LONGEST).to(goal.dtype), steps > LONGEST)
+
+    def _run(self, state: Tensor, goal: Tensor) -> Tensor:
+        """Steps until each arm, from its state (R, 15), is at its goal (R, 3); `LONGEST` + 1 for never."""
+        count = len(goal)
+        if count not in self._arms:
+            driven = TrapperArmRunner(self.static, count, scene=self.scene, num_threads=self.num_threads)
+            self._arms[count] = driven
+        arms = self._arms[count]
+        arms.reset(state[:, :6], state[:, 6:12])
+        arrived = torch.full((count,), LONGEST + 1)
+        for step in range(LONGEST + 1):
+            arrived = torch.where((arrived > LONGEST) & arms.is_reached(goal), step, arrived)
+            if bool((arrived <= LONGEST).all()):
+                break
+            arms.step(goal)
+        return arrived

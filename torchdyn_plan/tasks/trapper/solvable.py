@@ -1,0 +1,161 @@
+"""Which episodes can be solved at all, by the paper's definition with measured arrival times (Section IV-B)."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import torch
+from safetensors import SafetensorError
+from safetensors.torch import load_file, save_file
+from tensordict import TensorDictBase
+from torch import Tensor
+
+from torchdyn_plan.envs.trapper.arm_runner import TrapperArmRunner
+from torchdyn_plan.envs.trapper.contact import is_pocketed
+from torchdyn_plan.envs.trapper.scene import TrapperScene
+from torchdyn_plan.envs.trapper.simulation import TrapperSimulation
+from torchdyn_plan.envs.trapper.starts import draw_starts
+from torchdyn_plan.files import write_whole
+from torchdyn_plan.tasks.task import Truth
+from torchdyn_plan.tasks.trapper.task import TASK
+
+HORIZON = 300
+"""Control steps that the recorded truth goes on after the end of an episode."""
+
+SPACING = 0.02
+"""Greatest distance between neighbouring points of a map [m]."""
+LONGEST = 500
+"""Control steps after which an arm that has not arrived never does."""
+NEVER = 2**20
+"""Arrival at a place that the arm never reaches [control steps]."""
+SHIPPED = Path(__file__).parents[2] / "weights"
+"""Folder of the maps that come with the package."""
+
+
+class ArrivalMap(NamedTuple):
+    """Measured control steps from rest at home until a ball at a place of the table would be covered."""
+
+    steps: Tensor
+    """``(n, n)`` int64, x by y over the whole table; `NEVER` where the arm does not arrive."""
+    half_side: float
+    """Half of the table's side: the grid runs from -half_side to half_side [m]."""
+
+    def at(self, place: Tensor) -> Tensor:
+        """Steps at the map's point next to ``place`` (*B, 2 or 3) [m, world]: ``(*B,)`` int64."""
+        last = len(self.steps) - 1
+        index = ((place[..., :2] / self.half_side + 1.0) * (last / 2)).round().long()
+        inside = ((index >= 0) & (index <= last)).all(-1)
+        index = index.clamp(0, last)
+        return torch.where(inside, self.steps[index[..., 0], index[..., 1]], NEVER)
+
+
+def record_truth(
+    velocity: float, friction: float, *, episodes: int, seed: int, split: str, static: str, num_threads: int = 0
+) -> Truth:
+    """Where the balls of episodes 0 … E-1 roll, and which of them the arm can be at in time.
+
+    Args:
+        velocity: of the balls at the start [m/s].
+        friction: their friction loss [N].
+        episodes: number E of episodes.
+        seed: which series of episodes.
+        split: which family of series.
+        static: name of the static planner that drives the arm.
+        num_threads: of the simulation, 0 for all cores.
+    """
+    scene = TrapperScene()
+    driver = TASK.static_planner(static, chunk=TASK.rows_at_once[1])
+    arrivals = arrival_map(static, driver, scene, num_threads=num_threads)
+    place, speed = draw_starts(scene, torch.arange(episodes), velocity=velocity, split=split, seed=seed)
+    steps = TASK.max_steps + HORIZON
+    path = record_path(scene, place, speed, steps=steps, friction=friction, num_threads=num_threads)
+    return Truth(path, is_solvable(arrivals, scene, path[:, : TASK.max_steps + 1]))
+
+
+def is_solvable(arrivals: ArrivalMap, scene: TrapperScene, path: Tensor) -> Tensor:
+    """Whether for some t the arm, from rest at home, can be at the ball's place at step t within t steps: ``(*B,)``.
+
+    Args:
+        arrivals: measured arrivals of the static planner.
+        scene: where pockets are deep.
+        path: ``(*B, T, 3)`` true positions of the ball at steps 0 … T-1, the arm held still [m, world].
+    """
+    in_time = arrivals.at(path) <= torch.arange(path.shape[-2])
+    return (in_time & ~is_pocketed(scene, path)).any(-1)
+
+
+def record_path(
+    scene: TrapperScene, place: Tensor, velocity: Tensor, *, steps: int, friction: float = 0.0, num_threads: int = 0
+) -> Tensor:
+    """True positions ``(M, steps + 1, 3)`` [m, world] of balls that start at ``place`` with ``velocity``, (M, 2) each.
+
+    The arm's home pose touches no ball, so the ball rolls alone.
+    """
+    simulation = TrapperSimulation(len(place), scene, friction=friction, num_threads=num_threads, arm=False)
+    simulation.reset(torch.arange(len(place)), place, velocity)
+    path = torch.empty(len(place), steps + 1, 3)
+    path[:, 0] = simulation.ball_pos
+    for step in range(1, steps + 1):
+        simulation.step()
+        path[:, step] = simulation.ball_pos
+    return path
+
+
+def measure_arrivals(
+    planner: Callable[[TensorDictBase], TensorDictBase], scene: TrapperScene, *, num_threads: int = 0
+) -> ArrivalMap:
+    """Run ``planner`` from home to every point of a grid over the table, and look when it is there."""
+    from tqdm import tqdm
+
+    count = int(-(-scene.table_side // SPACING)) + 1
+    line = torch.linspace(-scene.half_side, scene.half_side, count)
+    grid = torch.cartesian_prod(line, line)
+    goals = torch.cat([grid, torch.full((len(grid), 1), scene.ball_radius)], dim=-1)
+    arms = TrapperArmRunner(planner, len(goals), scene=scene, num_threads=num_threads)
+    arrived = torch.full((len(goals),), NEVER)
+    for step in tqdm(range(LONGEST + 1), desc="measure arrivals", unit="step", leave=False):
+        arrived = torch.where((arrived == NEVER) & arms.is_reached(goals), step, arrived)
+        arms.step(goals)
+    return ArrivalMap(arrived.view(count, count), scene.half_side)
+
+
+def arrival_map(
+    static: str, planner: Callable[[TensorDictBase], TensorDictBase], scene: TrapperScene, *, num_threads: int = 0
+) -> ArrivalMap:
+    """The map of the static planner called ``static`` in ``scene``: shipped, cached, or measured now and cached."""
+    name = arrivals_name(static, scene)
+    for folder in (SHIPPED, _cache()):
+        steps = _load(folder / name)
+        if steps is not None:
+            return ArrivalMap(steps.long(), scene.half_side)
+    arrivals = measure_arrivals(planner, scene, num_threads=num_threads)
+    save_arrivals(arrivals, _cache() / name)
+    return arrivals
+
+
+def arrivals_name(static: str, scene: TrapperScene) -> str:
+    """Name of the file that holds the map of a static planner in a scene."""
+    return f"arrivals-{static}-{scene.digest()}.safetensors"
+
+
+def save_arrivals(arrivals: ArrivalMap, path: Path) -> None:
+    """Write the map to ``path``, whole or not at all."""
+    write_whole(path, lambda temporary: save_file({"steps": arrivals.steps.int()}, temporary))
+
+
+def _load(path: Path) -> Tensor | None:
+    """Steps in the file; None if there is none, or a damaged one, which is measured again."""
+    try:
+        content: dict[str, Any] = load_file(path)
+        steps: Tensor = content["steps"]
+    except (OSError, SafetensorError, KeyError):
+        return None
+    whole = steps.ndim == 2 and steps.shape[0] == steps.shape[1] and not steps.is_floating_point()
+    return steps if whole else None
+
+
+def _cache() -> Path:
+    return Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "torchdyn_plan"

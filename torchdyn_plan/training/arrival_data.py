@@ -1,0 +1,64 @@
+"""Recorded arrivals of a static planner: from which state to which goal in how many steps."""
+
+from pathlib import Path
+from typing import NamedTuple
+
+import torch
+from torch import Tensor
+
+from torchdyn_plan.checks import check_finite, check_trailing_shape
+from torchdyn_plan.errors import InputError
+from torchdyn_plan.training.windows import read_shards
+
+
+class Arrivals(NamedTuple):
+    """Samples of runs of a static planner."""
+
+    robot_state: Tensor
+    """(n, S), as the ETA network reads it."""
+    goal: Tensor
+    """(n, 3) [m, world]."""
+    arrival: Tensor
+    """(n,) int64 control steps until the goal was reached, -1 for never."""
+    run: Tensor
+    """(n,) int64: samples with one number come from one run."""
+
+    def take(self, rows: Tensor) -> "Arrivals":
+        """The samples ``rows`` (M,)."""
+        return Arrivals(*(tensor[rows] for tensor in self))
+
+
+def load_arrivals(folder: Path, *, state_size: int | None = None) -> Arrivals:
+    """Every ``arrivals-*.safetensors`` of ``folder`` as one.
+
+    Raises:
+        InputError: there is none, one is broken, or robot states have not ``state_size`` entries, if that is given.
+    """
+    shards = read_shards(folder, "arrivals", Arrivals._fields)
+    data = Arrivals(*(torch.cat([shard[name] for shard in shards]) for name in Arrivals._fields))
+    check_trailing_shape("goal", data.goal, 3)
+    if state_size is not None:
+        check_trailing_shape("robot_state of the arrivals", data.robot_state, state_size)
+    for name, tensor in zip(Arrivals._fields, data, strict=True):
+        if len(tensor) != len(data.run):
+            raise InputError(f"arrivals in {str(folder)!r} have {len(tensor)} rows of {name}, {len(data.run)} of run")
+        check_finite(f"{name} of the arrivals in {str(folder)!r}", tensor)
+    return data
+
+
+def split_groups(group: Tensor, seed: int, *, share: float = 0.1) -> tuple[Tensor, Tensor]:
+    """Rows to train on and rows to hold out, whole groups apart: int64 indices of ``group``, ascending.
+
+    Args:
+        group: ``(n,)`` int64: rows with one number stay together.
+        seed: which groups are held out.
+        share: of the groups that are held out, at least one.
+    """
+    names, member = group.unique(return_inverse=True)
+    if len(names) < 2:
+        raise InputError(f"needs at least 2 episodes or runs, one of them to hold out; got {len(names)}")
+    order = torch.randperm(len(names), generator=torch.Generator().manual_seed(seed))
+    held = torch.zeros(len(names), dtype=torch.bool)
+    held[order[: max(1, round(share * len(names)))]] = True
+    chosen = held[member]
+    return (~chosen).nonzero().squeeze(-1), chosen.nonzero().squeeze(-1)

@@ -1,0 +1,122 @@
+"""The fit of a spread to a frozen forecaster's errors, and how well it is calibrated; as the fits in `fit` go."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import asdict, replace
+from pathlib import Path
+
+import torch
+from torch import Tensor
+from torch.nn.functional import binary_cross_entropy_with_logits, softplus
+
+from torchdyn_plan.errors import InputError
+from torchdyn_plan.nets.forecaster import Forecaster
+from torchdyn_plan.nets.spread import Spread, SpreadConfig, SpreadNetwork
+from torchdyn_plan.tasks.task import Task
+from torchdyn_plan.training.card import Rows, Tables, read_description, write_network
+from torchdyn_plan.training.fit import task_fitting
+from torchdyn_plan.training.fitting import Fitting
+from torchdyn_plan.training.metrics import coverage, lost_probability
+from torchdyn_plan.training.optimise import Recipe, optimise
+from torchdyn_plan.training.path_data import PathSamples
+from torchdyn_plan.training.windows import Windows
+
+ROWS = 1024
+"""Rows that the networks see at once when they are scored."""
+
+
+def fit_spread(
+    task: Task,
+    data: Path,
+    out: Path,
+    recipe: Recipe | None = None,
+    *,
+    forecaster: str | Path,
+    config: SpreadConfig | None = None,
+    resume: bool = True,
+) -> Path:
+    """Fit a `SpreadNetwork` to the errors that ``forecaster`` makes on the ``paths`` in ``data``; it stays as it is.
+
+    With the paths and the seed that the forecaster was fitted with, the same episodes are held out: coverage is
+    measured on errors that neither network was fitted to.
+
+    ``forecaster`` is a name that ships, a file or a folder: else a `WeightsError`. ``config`` has the forecaster's
+    sizes by default; without ``resume`` a checkpoint in ``out`` is not continued.
+    """
+    fitting = task_fitting(task)
+    if not fitting.spread:
+        raise InputError(f"{task.name} has no spread to fit")
+    recipe = recipe or fitting.recipe("spread")
+    frozen = Forecaster.from_pretrained(forecaster, device=recipe.device).requires_grad_(False)
+    sizes = frozen.config
+    config = config or SpreadConfig(features=sizes.hidden, horizon=sizes.horizon)
+    about = read_description(data, "paths", scene=task.digest())
+    drawing = replace(fitting.windows, history=sizes.history, horizon=sizes.horizon)
+    samples = PathSamples.load(data, drawing, recipe.seed)
+    torch.manual_seed(recipe.seed)
+    network = SpreadNetwork(config).to(recipe.device)
+    windows = samples.held_windows(recipe.seed)
+
+    def loss(generator: torch.Generator) -> Tensor:
+        return spread_loss(frozen, network, samples.draw(recipe.batch, generator))
+
+    def validate() -> dict[str, float]:
+        return {"loss_held": float(spread_loss(frozen, network, windows))}
+
+    def score() -> Tables:
+        return _tables(frozen, network, windows, samples, fitting)
+
+    episodes = len(samples.paths.length)
+    settings = {"network": asdict(config), "scene": about["scene"], "episodes": episodes, "forecaster": str(forecaster)}
+    folder = out / SpreadNetwork.kind
+    optimise(network, loss, validate, recipe, out=folder, settings=settings, resume=resume)
+    counts = {"episodes": episodes, "held out": len(samples.held), "forecaster": forecaster}
+    return write_network(network, folder, score, task=task.name, recipe=recipe, facts=about | counts)
+
+
+def spread_loss(forecaster: Forecaster, network: SpreadNetwork, windows: Windows) -> Tensor:
+    """Negative log-likelihood of the errors' sizes (logistic in their logarithm), and of being lost or not.
+
+    Both are proper scores, averaged over the steps ahead. Errors count until the target is lost.
+    """
+    device = network.head.weight.device
+    with torch.no_grad():
+        forecast, features, swapped = forecaster.describe(windows.history.to(device))
+        error = (forecast - windows.future.to(device))[..., :2].abs() + network.config.finest
+    recorded = windows.recorded.to(device)
+    log_scale, log_shape, gone = network.raw(features, swapped)
+    beyond = log_shape.exp() * (error.log() - log_scale)
+    likelihood = log_shape - beyond - 2.0 * softplus(-beyond)
+    size = -(likelihood.mean(-1) * recorded).sum() / recorded.sum().clamp_min(1)
+    return size + binary_cross_entropy_with_logits(gone, (~recorded).to(gone.dtype))
+
+
+def _tables(
+    forecaster: Forecaster, network: SpreadNetwork, windows: Windows, samples: PathSamples, fitting: Fitting
+) -> Tables:
+    def covered(seen: Windows) -> tuple[Spread, Rows]:
+        forecast, spread = predict(forecaster, network, seen.history)
+        return spread, coverage(forecast, spread, seen, ahead=fitting.ahead, fast=fitting.fast, near=fitting.near)
+
+    spread, rows = covered(windows)
+    tables = {"Coverage on held-out windows": rows}
+    if fitting.lost is not None:
+        tables["Lost targets"] = lost_probability(spread, windows, ahead=fitting.ahead)
+    if fitting.extra_coverage is not None:
+        extra = fitting.extra_coverage(samples.drawing)
+        tables[extra.caption] = [
+            columns | row for columns, seen in extra.windows for row in covered(seen)[1] if row["windows"] == "full"
+        ]
+    return tables
+
+
+def predict(forecaster: Forecaster, network: SpreadNetwork, history: Tensor) -> tuple[Tensor, Spread]:
+    """Forecasts ``(n, F, 3)`` [m, world] and their spread for histories ``(n, H, 3)``, on the CPU."""
+    device = network.head.weight.device
+    parts: list[Sequence[Tensor]] = []
+    for rows in history.split(ROWS):
+        forecast, features, swapped = forecaster.describe(rows.to(device))
+        parts.append([forecast.cpu(), *(part.cpu() for part in network(features, swapped))])
+    forecast, *spread = (torch.cat(tensors) for tensors in zip(*parts, strict=True))
+    return forecast, Spread(*spread)

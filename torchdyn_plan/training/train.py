@@ -1,0 +1,100 @@
+"""Trains any network of any task: what `torchdyn-plan train` runs."""
+
+from __future__ import annotations
+
+import dataclasses
+from pathlib import Path
+from typing import Any
+
+from torchdyn_plan.errors import InputError
+from torchdyn_plan.tasks.task import Task, load_task
+
+
+def networks(task: Task) -> tuple[str, ...]:
+    """Names of the networks that ``task`` can train: those fitted to data, then its policies."""
+    fitted: tuple[str, ...] = ()
+    if task.fitting is not None:
+        if task.record_paths is not None:
+            fitted += ("forecaster", "spread")
+        if task.record_arrivals is not None:
+            fitted += ("eta",)
+    return (*fitted, *task.policies)
+
+
+def train(
+    task: Task | str,
+    network: str,
+    data: Path,
+    out: Path,
+    *,
+    steps: int | None = None,
+    batch: int | None = None,
+    lr: float | None = None,
+    seed: int = 0,
+    device: str = "cpu",
+    resume: bool = True,
+    num_envs: int | None = None,
+    num_threads: int = 0,
+    workers: int = 0,
+    options: Any = None,
+) -> Path:
+    """Train a network, or go on where its folder stands.
+
+    Args:
+        task: whose network, or its name.
+        network: ``forecaster``, ``eta``, ``spread``, or one of the task's policies. A spread is fitted to the errors of
+            the forecaster in ``out``, or of the one that ships if there is none.
+        data: folder of the collected shards; a policy reads none.
+        out: gets a folder of the network's name with checkpoint, curve, weights and card.
+        steps: optimiser steps, of a policy rounds; the recipe's own for None, as are ``batch`` and ``lr``.
+        batch: samples a step.
+        lr: highest learning rate; of a policy the critic's, and the actor's in the proportion of its recipe.
+        seed: of initialisation, held-out data and draws.
+        device: where to train.
+        resume: whether to continue from the checkpoint in ``out``.
+        num_envs: of a policy: episodes that run side by side; the recipe's own for None.
+        num_threads: of a policy: threads of the simulation, 0 for all cores; does not change the result.
+        workers: of a policy: Ray workers that run the episodes, 0 for none.
+        options: of a policy: an instance of its `PolicyTraining.options`; the defaults for None.
+
+    Returns:
+        The weights' file.
+
+    Raises:
+        InputError: the task has no such network, data is missing, damaged or of another scene, or an argument is wrong.
+        TrainingError: a loss is NaN, or the checkpoint is damaged or of another recipe.
+    """
+    from torchdyn_plan.checks import check_choice
+
+    task = load_task(task)
+    check_choice(f"network of {task.name}", network, networks(task))
+    given = {"batch": batch, "seed": seed}
+    if network in task.policies:
+        from torchdyn_plan.training.policy import train_policy
+
+        rounds = {"iterations": steps, "num_envs": num_envs}
+        machine = {"num_threads": num_threads, "workers": workers, "device": device, "resume": resume}
+        return train_policy(task, network, out, lr=lr, options=options, changes=given | rounds, **machine)
+    _refuse_policy_arguments(network, num_envs=num_envs, workers=workers or None, options=options)
+    from torchdyn_plan.training import fit, fit_spread
+
+    own = fit.task_fitting(task).recipe(network)
+    recipe = changed(own, steps=steps, lr=lr, device=device, **given)
+    if network == "forecaster":
+        return fit.fit_forecaster(task, data, out, recipe, resume=resume)
+    if network == "eta":
+        return fit.fit_eta(task, data, out, recipe, resume=resume)
+    beside = out / "forecaster" / "forecaster.safetensors"
+    forecaster = beside if beside.exists() else task.name
+    return fit_spread.fit_spread(task, data, out, recipe, forecaster=forecaster, resume=resume)
+
+
+def _refuse_policy_arguments(network: str, **given: Any) -> None:
+    for name, value in given.items():
+        if value is not None:
+            raise InputError(f"{name} is of policies, which learn by trial: {network} has none, got {value!r}")
+
+
+def changed(recipe: Any, **changes: Any) -> Any:
+    """``recipe`` with those ``changes`` that are not None."""
+    return dataclasses.replace(recipe, **{name: value for name, value in changes.items() if value is not None})
