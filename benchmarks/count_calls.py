@@ -25,6 +25,7 @@ from study import Output, Study, measuring
 import torchdyn_plan
 from torchdyn_plan import keys
 from torchdyn_plan.kinematics import Arm, solve_ik
+from torchdyn_plan.planners import DynamicPlanner
 from torchdyn_plan.tasks import DEFAULT, Task, load_task
 
 ROOT = Path(torchdyn_plan.__file__).parent
@@ -112,8 +113,13 @@ def acts(task: Task, planners: Sequence[str], batch: int) -> Iterator[tuple[str,
     """Every act by its name, and its calls."""
     env = task.make_env(task.default_settings(), num_envs=batch, seed=0, split="dev", num_threads=1)
     for name in planners:
-        for what, calls in follow_planner(task.planner(name), env).items():
-            yield f"{name}, {what}", calls
+        planner = task.planner(name)
+        forms = {name: planner}
+        if isinstance(planner, DynamicPlanner):
+            forms[f"{name} for inference"] = planner.for_inference()
+        for form, one in forms.items():
+            for what, calls in follow_planner(one, env).items():
+                yield f"{form}, {what}", calls
     yield "a step of the environment", follow_env(env)
     yield "solve_ik at its solution", follow_ik(batch)
 

@@ -3,7 +3,7 @@
     git worktree add /tmp/former 65afd9a
     python benchmarks/former_latency.py --former /tmp/former --out latency.json
 
-Either checkout runs in a process of its own, on one thread; both are timed block by block in turn, on the same recorded
+Either checkout runs in processes of its own, on one thread. Both are timed block by block in turn, on the same recorded
 observations at batch 1, so that whatever else the machine does hits both alike. A ratio is the median over pairs of
 blocks of this checkout's median over the other's.
 """
@@ -57,8 +57,10 @@ class Arguments(Output):
     """Static planners."""
     calls: tuple[str, ...] = tuple(CALLS)
     """What is timed."""
-    rounds: int = 20
-    """Blocks of either checkout."""
+    processes: int = 5
+    """Fresh processes of either checkout: where its code comes to lie is worth a percent or two."""
+    rounds: int = 8
+    """Blocks in each of them."""
     seconds: float = 0.1
     """Length of a block."""
 
@@ -108,18 +110,24 @@ def record(file: Path) -> None:
     save_file({key: whole[key].contiguous() for key in SEEN}, file)
 
 
-def compare(here: Checkout, there: Checkout, planner: str, static: str, arguments: Arguments) -> Iterator[Row]:
+def compare(observations: Path, planner: str, static: str, arguments: Arguments) -> Iterator[Row]:
     """A row for each call of one planner."""
-    compiled = "plan_compiled" in arguments.calls
-    prepared = [side.ask("prepare", planner, static, compiled) for side in (here, there)]
-    same = {f"same_{name}": prepared[0][name] == prepared[1][name] for name in ("plans", "actions")}
+    blocks: dict[str, list[tuple[float, float]]] = {call: [] for call in arguments.calls}
+    same: dict[str, bool] = {}
+    for _ in each(range(arguments.processes), f"{planner}, {static}"):
+        here, there = (Checkout(root.resolve(), observations) for root in (HERE.parent, arguments.former))
+        prepared = [side.ask("prepare", planner, static, "plan_compiled" in arguments.calls) for side in (here, there)]
+        for name in ("plans", "actions"):
+            same[f"same_{name}"] = same.get(f"same_{name}", True) and prepared[0][name] == prepared[1][name]
+        for call in arguments.calls:
+            for number in range(arguments.rounds):
+                sides = (here, there) if number % 2 == 0 else (there, here)
+                medians = {side: statistics.median(side.ask("time", call, arguments.seconds)) for side in sides}
+                blocks[call].append((medians[here], medians[there]))
+        here.close()
+        there.close()
     for call in arguments.calls:
-        blocks: list[tuple[float, float]] = []
-        for number in each(range(arguments.rounds), f"{planner}, {static}, {call}"):
-            sides = (here, there) if number % 2 == 0 else (there, here)
-            medians = {side: statistics.median(side.ask("time", call, arguments.seconds)) for side in sides}
-            blocks.append((medians[here], medians[there]))
-        yield {"planner": planner, "static": static, "call": CALLS[call], **_figures(blocks), **same}
+        yield {"planner": planner, "static": static, "call": CALLS[call], **_figures(blocks[call]), **same}
 
 
 def _figures(blocks: list[tuple[float, float]]) -> dict[str, float]:
@@ -136,13 +144,10 @@ def main(arguments: Arguments) -> None:
     with tempfile.TemporaryDirectory() as folder, measuring():
         observations = Path(folder) / "observations.safetensors"
         record(observations)
-        here, there = (Checkout(root.resolve(), observations) for root in (HERE.parent, arguments.former))
         for planner in arguments.planners:
             for static in arguments.statics:
-                for row in compare(here, there, planner, static, arguments):
+                for row in compare(observations, planner, static, arguments):
                     study.add(row)
-        here.close()
-        there.close()
 
 
 if __name__ == "__main__":

@@ -17,7 +17,7 @@ SMALL = {
     "count_calls": "--planners corner --batch 2",
     "diagnose": "--velocities 3 --episodes 4 --arrivals network --split dev",
     "forecast_gain": "--episodes 2 --seeds 0 --velocity 5",
-    "former_latency": "--former . --planners corner --statics ik --rounds 1 --seconds 0.01 --calls plan",
+    "former_latency": "--former . --planners corner --statics ik --processes 1 --rounds 1 --seconds 0.01 --calls plan",
     "joint_speeds": "--episodes 4 --num-envs 4",
     "latency": "--velocities 5 --episodes 2 --latencies 0 20 --not-compensated 20",
     "reach_ceiling": "--velocities 0.03 --episodes 8 --other-velocities 0.03 --other-episodes 8 --bounds-alone",

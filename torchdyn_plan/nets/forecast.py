@@ -12,7 +12,7 @@ from torchdyn_plan import keys
 from torchdyn_plan.errors import InputError
 
 if TYPE_CHECKING:
-    from torchdyn_plan.nets.spread import Spread
+    from torchdyn_plan.nets.distributions import Spread
 
 
 class Forecast(NamedTuple):
