@@ -72,10 +72,10 @@ class Forecaster(Pretrained, DescribedForecast):
     config_type = ForecasterConfig
     symmetries: Tensor
     steps_ahead: Tensor
-    _step_scale: Tensor
-    _present_scale: Tensor
-    _time: Tensor
-    _scale: Tensor
+    step_feature_scale: Tensor
+    present_feature_scale: Tensor
+    step_factor: Tensor
+    departure_scale: Tensor
 
     def __init__(self, config: ForecasterConfig | None = None, **settings: Any) -> None:
         """Build the network from ``config``, or from the fields of `ForecasterConfig` given as keywords."""
@@ -102,10 +102,10 @@ class Forecaster(Pretrained, DescribedForecast):
         constants = {
             "symmetries": square_symmetries(),
             "steps_ahead": steps,
-            "_step_scale": torch.tensor([*step, 0.2, 0.2, 0.2, 1.0]),
-            "_present_scale": torch.tensor(present),
-            "_time": torch.stack([steps, steps, torch.zeros_like(steps)]),
-            "_scale": torch.stack([level, level, height]),
+            "step_feature_scale": torch.tensor([*step, 0.2, 0.2, 0.2, 1.0]),
+            "present_feature_scale": torch.tensor(present),
+            "step_factor": torch.stack([steps, steps, torch.zeros_like(steps)]),
+            "departure_scale": torch.stack([level, level, height]),
         }
         for name, value in constants.items():
             self.register_buffer(name, value, persistent=False)
@@ -175,15 +175,15 @@ class Forecaster(Pretrained, DescribedForecast):
         joined = torch.cat([features.flatten(1), self._present_features(now, newest)], dim=-1)
         hidden = self.hidden(self.join(joined).relu_()).relu_()
         departure = self.head(self.mix(hidden)).view(-1, 3, self.config.horizon)
-        straight = torch.addcmul(now.unsqueeze(-1), newest.unsqueeze(-1), self._time)
-        return torch.addcmul(straight, departure, self._scale), hidden
+        straight = torch.addcmul(now.unsqueeze(-1), newest.unsqueeze(-1), self.step_factor)
+        return torch.addcmul(straight, departure, self.departure_scale), hidden
 
     def _step_features(self, step: Tensor) -> Tensor:
         """Each step, its difference from the newest one, and whether it is no padding, ``(R, H-1, 7)``."""
         real = (step != 0).any(dim=-1, keepdim=True)
         # Braking changes a step by a thousandth, a bounce by twice itself: a logarithm shows both.
         change = torch.asinh((step - step[:, -1:]) * (real / self.config.change_scale))
-        return torch.cat([step, change, real.to(step.dtype)], dim=-1) * self._step_scale
+        return torch.cat([step, change, real.to(step.dtype)], dim=-1) * self.step_feature_scale
 
     def _present_features(self, now: Tensor, step: Tensor) -> Tensor:
         """Newest position and step, ``(R, 3)`` each, and when and where they lead to a cushion: ``(R, P)``."""
@@ -193,7 +193,7 @@ class Forecaster(Pretrained, DescribedForecast):
             direction = torch.where(speed < 0, -1.0, 1.0)
             wait = (extent - place * direction).div_((speed * direction).clamp_min(1e-6)).clamp(0.0, 2.0 * horizon)
             features += [wait, wait.log1p(), reflect(torch.addcmul(place, speed, wait.flip(-1)), extent)]
-        return torch.cat(features, dim=-1) * self._present_scale
+        return torch.cat(features, dim=-1) * self.present_feature_scale
 
     def _check(self, target_history: Tensor) -> None:
         check_trailing_shape("target_history", target_history, self.config.history, 3)

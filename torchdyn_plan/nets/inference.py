@@ -68,7 +68,7 @@ class InferenceForecaster(DescribedForecast):
         dtype, exact = network.head.weight.dtype, copy.deepcopy(network).double()
         hold_constants(self, dtype, turns=_turns(exact), octants=_octants(exact))
         embed: Any = exact.embed
-        weight = embed.weight.squeeze(-1) * exact._step_scale
+        weight = embed.weight.squeeze(-1) * exact.step_feature_scale
         hold_constants(self, dtype, embed_weight=weight.mT, embed_bias=embed.bias, zero=torch.zeros(1))
         length, self.dense = config.history - 1, []
         for number, layer in enumerate(exact.convolve):
@@ -289,8 +289,8 @@ def _convolution(layer: Any, length: int) -> tuple[Tensor, Tensor, int, bool]:
 def _join(network: Forecaster) -> tuple[Tensor, Tensor]:
     """Weight and bias of the layer that joins convolved steps (features inmost), and the present's bare features."""
     config, weight, bias = network.config, network.join.weight.clone(), network.join.bias.clone()
-    present = len(network._present_scale)
-    weight[:, -present:] *= network._present_scale
+    present = len(network.present_feature_scale)
+    weight[:, -present:] *= network.present_feature_scale
     if config.half_extent is not None:
         bias += config.half_extent * weight[:, -2:].sum(1)
         weight[:, -2:] *= -4.0 * config.half_extent
@@ -300,11 +300,11 @@ def _join(network: Forecaster) -> tuple[Tensor, Tensor]:
 def _head(network: Forecaster) -> tuple[Tensor, Tensor]:
     """Weight and bias that give the line, in `InferenceForecaster`'s units, for mixture, newest position and step."""
     extent, horizon = network.config.half_extent, network.config.horizon
-    scale, unit = network._scale.reshape(-1), network._scale.new_ones(3, 1)
+    scale, unit = network.departure_scale.reshape(-1), network.departure_scale.new_ones(3, 1)
     weight, bias = network.head.weight * scale.unsqueeze(-1), (network.head.bias * scale).view(3, horizon)
     eye = torch.eye(3, dtype=torch.float64).unsqueeze(1)
     now = eye.expand(3, horizon, 3)
-    newest = eye * network._time.unsqueeze(-1)
+    newest = eye * network.step_factor.unsqueeze(-1)
     whole = torch.cat([weight.view(3, horizon, -1), now, newest], dim=-1)
     if extent is not None:
         unit[:2] = 0.25 / extent
