@@ -34,6 +34,27 @@ def check_same_device(name: str, tensor: Tensor, device: torch.device, owner: st
         raise InputError(f"{name} is on {tensor.device}, but {owner} is on {device}: move one of them")
 
 
+def check_input(
+    name: str, tensor: Tensor, *trailing: int, device: torch.device, owner: str, finite: bool = True
+) -> None:
+    """All three checks of a network's input, unless it is compiled.
+
+    Args:
+        name: of the argument.
+        tensor: must have shape ``(*B, *trailing)``.
+        trailing: sizes of the last dimensions.
+        device: of the network.
+        owner: the network's name.
+        finite: it must hold no NaN or infinity, either.
+    """
+    if torch.compiler.is_compiling():
+        return
+    check_trailing_shape(name, tensor, *trailing)
+    check_same_device(name, tensor, device, owner)
+    if finite:
+        check_finite(name, tensor)
+
+
 def check_choice(name: str, value: str, choices: Iterable[str]) -> None:
     """Raise `InputError` unless ``value`` is one of ``choices``; suggests the nearest."""
     known = sorted(choices)

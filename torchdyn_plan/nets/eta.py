@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 import torch
 from torch import Tensor, nn
 
-from torchdyn_plan.checks import check_choice, check_finite, check_number, check_same_device, check_trailing_shape
+from torchdyn_plan.checks import check_choice, check_input, check_number
 from torchdyn_plan.errors import InputError
 from torchdyn_plan.nets.arrival import ArrivalModel
 from torchdyn_plan.nets.distributions import ESTIMATORS, Arrival
@@ -96,8 +96,9 @@ class ETANetwork(Pretrained, ArrivalModel):
         Raises:
             InputError: a trailing shape or a device is wrong, or an input holds a NaN.
         """
-        if not torch.compiler.is_compiling():
-            self._check(robot_state, goal)
+        about: Any = {"device": self.head.weight.device, "owner": type(self).__name__}
+        check_input("robot_state", robot_state, self.config.robot_state_size, **about)
+        check_input("goal", goal, 3, **about)
         state = torch.addcmul(self.state_shift, robot_state, self.state_scale)
         target = torch.addcmul(self.goal_shift, self._goal_features(robot_state, goal), self.goal_scale)
         hidden = (self.state_in(state) + self.goal_in(target)).relu_()
@@ -129,13 +130,6 @@ class ETANetwork(Pretrained, ArrivalModel):
         level = torch.linalg.vector_norm(offset[..., :2], dim=-1, keepdim=True)
         full = torch.linalg.vector_norm(offset, dim=-1, keepdim=True)
         return torch.cat([goal.expand(offset.shape), offset, level, full], dim=-1)
-
-    def _check(self, robot_state: Tensor, goal: Tensor) -> None:
-        device = self.head.weight.device
-        for name, tensor, size in (("robot_state", robot_state, self.config.robot_state_size), ("goal", goal, 3)):
-            check_trailing_shape(name, tensor, size)
-            check_same_device(name, tensor, device, type(self).__name__)
-            check_finite(name, tensor)
 
 
 def arrival_classes(arrival: Tensor, *, bins: int = 100, bin_width: int = 5) -> tuple[Tensor, Tensor]:

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 import torch
 from torch import Tensor, nn
 
-from torchdyn_plan.checks import check_finite, check_number, check_same_device, check_trailing_shape
+from torchdyn_plan.checks import check_input, check_number
 from torchdyn_plan.errors import InputError
 from torchdyn_plan.nets.forecast import DescribedForecast
 from torchdyn_plan.nets.pretrained import Pretrained
@@ -147,9 +147,9 @@ class Forecaster(Pretrained, DescribedForecast):
 
     def _forecast(self, target_history: Tensor, *, reflected: bool) -> tuple[Tensor, Tensor, Tensor]:
         """Positions (*B, F, 3), hidden features (R, hidden) and whether x and y are exchanged in them (R,)."""
-        if not torch.compiler.is_compiling():
-            self._check(target_history)
-        config = self.config
+        config, owner = self.config, type(self).__name__
+        device = self.head.weight.device
+        check_input("target_history", target_history, config.history, 3, device=device, owner=owner)
         history, turn = target_history.reshape(-1, config.history, 3), None
         if config.square_symmetry:
             now, before = history[:, -1, :2], history[:, -2, :2]
@@ -194,11 +194,6 @@ class Forecaster(Pretrained, DescribedForecast):
             wait = (extent - place * direction).div_((speed * direction).clamp_min(1e-6)).clamp(0.0, 2.0 * horizon)
             features += [wait, wait.log1p(), reflect(torch.addcmul(place, speed, wait.flip(-1)), extent)]
         return torch.cat(features, dim=-1) * self.present_feature_scale
-
-    def _check(self, target_history: Tensor) -> None:
-        check_trailing_shape("target_history", target_history, self.config.history, 3)
-        check_same_device("target_history", target_history, self.head.weight.device, type(self).__name__)
-        check_finite("target_history", target_history)
 
 
 def convolve(features: Tensor, layer: Any) -> Tensor:

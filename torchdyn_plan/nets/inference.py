@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any
 import torch
 from torch import Tensor, nn
 
-from torchdyn_plan.checks import check_choice, check_finite, check_same_device, check_trailing_shape
+from torchdyn_plan.checks import check_choice, check_input
 from torchdyn_plan.nets.arrival import ArrivalModel, ArrivalQuery
 from torchdyn_plan.nets.distributions import ESTIMATORS, Arrival, Spread, arrival_moments
 from torchdyn_plan.nets.forecast import DescribedForecast, Forecast
@@ -247,14 +247,12 @@ class InferenceETA(ArrivalModel):
 
 
 def _check(name: str, tensor: Tensor, device: torch.device, *trailing: int) -> None:
-    """Raise `InputError` for a wrong shape or device, or for what is no number: a quick look, then a thorough one."""
+    """As `check_input`, after a quick look that passes nearly always."""
     if torch.compiler.is_compiling():
         return
     if tensor.shape[-len(trailing) :] == trailing and tensor.device == device and math.isfinite(tensor.sum().item()):
         return
-    check_trailing_shape(name, tensor, *trailing)
-    check_same_device(name, tensor, device, "the network")
-    check_finite(name, tensor)
+    check_input(name, tensor, *trailing, device=device, owner="the network")
 
 
 def _turns(network: Forecaster) -> Tensor:

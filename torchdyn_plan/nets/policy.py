@@ -9,7 +9,7 @@ from typing import Any
 import torch
 from torch import Tensor, nn
 
-from torchdyn_plan.checks import check_finite, check_number, check_same_device, check_trailing_shape
+from torchdyn_plan.checks import check_finite, check_input, check_number
 from torchdyn_plan.errors import InputError
 from torchdyn_plan.nets.pretrained import Pretrained
 
@@ -111,22 +111,17 @@ class Actor(Pretrained, nn.Module):
         Raises:
             InputError: a trailing shape or a device is wrong, or an input holds a NaN.
         """
-        checked = not torch.compiler.is_compiling()
-        if checked:
-            self._check(robot_state, goal)
+        about: Any = {"device": self.features.scale.device, "owner": type(self).__name__, "finite": False}
+        check_input("robot_state", robot_state, self.config.robot_state_size, **about)
+        check_input("goal", goal, 3, **about)
         hidden = self.features(robot_state, goal)
-        if checked and not math.isfinite(hidden.sum().item()):
+        # Looked at once, where both have come together.
+        if not torch.compiler.is_compiling() and not math.isfinite(hidden.sum().item()):
             check_finite("robot_state", robot_state)
             check_finite("goal", goal)
         for layer in self.body:
             hidden = layer(hidden)
         return torch.tanh(hidden)
-
-    def _check(self, robot_state: Tensor, goal: Tensor) -> None:
-        device = self.features.scale.device
-        for name, tensor, size in (("robot_state", robot_state, self.config.robot_state_size), ("goal", goal, 3)):
-            check_trailing_shape(name, tensor, size)
-            check_same_device(name, tensor, device, type(self).__name__)
 
 
 class Critic(nn.Module):

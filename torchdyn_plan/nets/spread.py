@@ -6,7 +6,7 @@ from typing import Any
 import torch
 from torch import Tensor, nn
 
-from torchdyn_plan.checks import check_number, check_same_device, check_trailing_shape
+from torchdyn_plan.checks import check_input, check_number
 from torchdyn_plan.errors import InputError
 from torchdyn_plan.nets.distributions import Spread
 from torchdyn_plan.nets.forecast import DescribedForecast, Forecast, ForecastModel
@@ -73,20 +73,16 @@ class SpreadNetwork(Pretrained, nn.Module):
 
     def raw(self, features: Tensor, swapped: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         """Logarithms of scale and shape (*B, F, 2) and the logit of being gone (*B, F): what training compares."""
-        if not torch.compiler.is_compiling():
-            self._check(features, swapped)
+        device, owner = self.head.weight.device, type(self).__name__
+        check_input("features", features, self.config.features, device=device, owner=owner, finite=False)
+        if swapped.shape != features.shape[:-1] or swapped.dtype != torch.bool:
+            expected = f"bool of shape {tuple(features.shape[:-1])}"
+            raise InputError(f"swapped must be {expected}, got {swapped.dtype} of shape {tuple(swapped.shape)}")
         out = self.head(self.mix(self.hidden(features).relu()))
         out = out.view(*features.shape[:-1], 5, self.config.horizon)
         level = out[..., :4, :].unflatten(-2, (2, 2)).transpose(-1, -2)
         level = torch.where(swapped[..., None, None, None], level.flip(-1), level)
         return level[..., 0, :, :].clamp(-18.0, 4.0), level[..., 1, :, :].clamp(-3.0, 3.0), out[..., 4, :]
-
-    def _check(self, features: Tensor, swapped: Tensor) -> None:
-        check_trailing_shape("features", features, self.config.features)
-        check_same_device("features", features, self.head.weight.device, type(self).__name__)
-        if swapped.shape != features.shape[:-1] or swapped.dtype != torch.bool:
-            expected = f"bool of shape {tuple(features.shape[:-1])}"
-            raise InputError(f"swapped must be {expected}, got {swapped.dtype} of shape {tuple(swapped.shape)}")
 
 
 class SpreadForecaster(ForecastModel):
