@@ -54,7 +54,7 @@ def run(env: TrapperEnv, planner: DynamicPlanner, episode: int) -> tuple[bool, l
 
 def main(file: str, before: int = 160) -> None:
     """Draw the first trap that comes after a bounce and a long way, ``before`` steps before it."""
-    env, planner = TrapperEnv(1, velocity=3.0, split="dev"), DynamicPlanner.from_pretrained("trapper-ik")
+    env, planner = TrapperEnv(1, velocity=3.0, split="dev", seed=0), DynamicPlanner.from_pretrained("trapper-ik")
     for episode in range(100):
         trapped, scenes, meetings = run(env, planner, episode)
         path = np.array(scenes)[:, :3]

@@ -46,7 +46,7 @@ KEYS: tuple[Key, ...] = (
     Key(name=OBSERVATION, shape=("S",), meaning="robot state under TorchRL's name", writer="env"),
     Key(name=ACHIEVED_GOAL, shape=(3,), meaning="tool position under Gymnasium's name [m, world]", writer="env"),
     Key(name=DESIRED_GOAL, shape=(3,), meaning="place to reach [m, world]", writer="env"),
-    Key(name=STEP_COUNT, shape=(), meaning="control steps since the reset", writer="env"),
+    Key(name=STEP_COUNT, shape=(1,), meaning="control steps since the reset", writer="env"),
     Key(name=EPISODE, shape=(), meaning="index of the episode within its split and seed", writer="env"),
     Key(name=GOAL, shape=(3,), meaning="place the static planner is sent to [m, world]", writer="planner"),
     Key(name=ARRIVAL_STEPS, shape=(), meaning="control steps from now to the meeting", writer="planner"),

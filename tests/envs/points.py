@@ -14,12 +14,11 @@ class PointEnv(MovingTargetEnv):
     flags = ("met", "gone")
 
     def __init__(self, num_envs: int = 2, *, speed: float = 0.05, scene: str | None = None, **series: object) -> None:
-        super().__init__(num_envs, state_size=3, action_size=3, **series)
+        super().__init__(num_envs, state_size=3, action_size=3, **{"seed": 0, **series})
         self.speed, self.scene_digest = speed, scene
         self.tool_pos, self.target = torch.zeros(num_envs, 3), torch.zeros(num_envs, 3)
 
     def _start(self, rows: Tensor, episodes: Tensor) -> Tensor:
-        self.tool_pos, self.target = self.tool_pos.clone(), self.target.clone()
         self.tool_pos[rows] = 0.0
         self.target[rows] = draw_uniform(episodes, 3, split=self.split, seed=self.seed).float()
         return self.target[rows]

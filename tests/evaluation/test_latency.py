@@ -14,7 +14,7 @@ SCHEDULE = ReplanSchedule(first_step=3, window=7, minimum=5)
 
 def goals(planner, steps=16):
     with torch.no_grad():
-        return TrapperEnv(2, num_threads=1).rollout(steps, planner, break_when_any_done=False)["goal"]
+        return TrapperEnv(2, seed=0, num_threads=1).rollout(steps, planner, break_when_any_done=False)["goal"]
 
 
 def delivered(planner, delivery):

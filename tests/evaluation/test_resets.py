@@ -9,7 +9,7 @@ SOON = ReplanSchedule(first_step=3, window=7, minimum=5)
 
 
 def alone(episode, length, max_steps):
-    env = TrapperEnv(1, max_steps=max_steps, num_threads=1)
+    env = TrapperEnv(1, max_steps=max_steps, seed=0, num_threads=1)
     env.start_from(episode)
     return env.rollout(length, untrained(schedule=SOON), break_when_any_done=False)[0]
 
@@ -31,7 +31,7 @@ def assert_as_if_alone(data, at_least, max_steps=15):
 
 
 def test_the_planners_memory_survives_auto_reset():
-    env, planner, rows = TrapperEnv(3, max_steps=15, num_threads=1), untrained(schedule=SOON), []
+    env, planner, rows = TrapperEnv(3, max_steps=15, seed=0, num_threads=1), untrained(schedule=SOON), []
     td = env.reset()
     for _ in range(46):
         data, td = env.step_and_maybe_reset(planner(td))
@@ -40,7 +40,7 @@ def test_the_planners_memory_survives_auto_reset():
 
 
 def test_the_planners_memory_survives_a_reset_of_some_rows():
-    env, planner, rows = TrapperEnv(3, max_steps=15, num_threads=1), untrained(schedule=SOON), []
+    env, planner, rows = TrapperEnv(3, max_steps=15, seed=0, num_threads=1), untrained(schedule=SOON), []
     td = env.reset()
     for step in range(35):
         stepped = env.step(planner(td))
@@ -56,7 +56,7 @@ def test_the_planners_memory_survives_a_reset_of_some_rows():
 def test_the_planners_memory_survives_a_collector():
     planner = untrained(schedule=SOON)
     frames = {"frames_per_batch": 60, "total_frames": 120, "auto_register_policy_transforms": False}
-    collector = Collector(lambda: TrapperEnv(3, max_steps=15, num_threads=1), planner, **frames)
+    collector = Collector(lambda: TrapperEnv(3, max_steps=15, seed=0, num_threads=1), planner, **frames)
     data = torch.cat([batch.clone() for batch in collector], dim=-1)
     collector.shutdown()
     assert_as_if_alone(data, 6)

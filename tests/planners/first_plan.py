@@ -9,7 +9,7 @@ FIRST_STEP = 13
 
 def first_plan(count, **settings):
     """Tensordict of ``count`` episodes after `FIRST_STEP` steps in which the arm stood still."""
-    env = TrapperEnv(count, num_threads=1, **settings)
+    env = TrapperEnv(count, seed=0, num_threads=1, **settings)
     td = env.reset()
     for _ in range(FIRST_STEP):
         td = env.step_mdp(env.step(td.set("action", torch.zeros(count, 6))))

@@ -66,7 +66,7 @@ class ArmRunner(ABC):
         result = self.planner(TensorDict(entries, batch_size=[self.num_envs]))
         self._memory = result.get(keys.PLAN, None)
         self._steps = self._steps + 1
-        self._drive(result[keys.ACTION])
+        self._drive(result[keys.ACTION].detach())
 
 
 class EnvRunner(ArmRunner):

@@ -6,6 +6,7 @@ from abc import abstractmethod
 from collections.abc import Callable
 from typing import Any, ClassVar, NamedTuple
 
+import numpy as np
 import torch
 from tensordict import TensorDict, TensorDictBase
 from torch import Tensor
@@ -14,7 +15,7 @@ from torchrl.envs import EnvBase
 
 from torchdyn_plan import keys
 from torchdyn_plan.checks import check_choice, check_finite, check_number, check_trailing_shape
-from torchdyn_plan.envs.episodes import SPLITS
+from torchdyn_plan.envs.episodes import SPLITS, somewhere
 from torchdyn_plan.envs.specs import flag_spec, observation_spec
 from torchdyn_plan.errors import InputError
 
@@ -22,8 +23,12 @@ ENDS = ("done", "terminated", "truncated")
 """Keys that tell whether an episode has ended."""
 
 
+RENDER_MODES = ("rgb_array",)
+"""What `MovingTargetEnv.render` can make."""
+
+
 class RobotReading(NamedTuple):
-    """What N robots' sensors read, float32; the environment changes none of these tensors in place afterwards."""
+    """What N robots' sensors read, float32; the environment shows copies of these tensors."""
 
     tool_pos: Tensor
     """``(N, 3)`` [m, world]."""
@@ -36,13 +41,17 @@ class RobotReading(NamedTuple):
 
 
 class MovingTargetEnv(EnvBase):
-    """N independent episodes of a robot and a target, ``batch_size [num_envs]``, on the CPU.
+    """N independent episodes of a robot and a target, ``batch_size [num_envs]``, simulated on the CPU.
 
     Entries are those of `torchdyn_plan.keys` and the task's own `flags`. A task says how an episode starts (`_start`),
     what a control step does (`_advance`), what the robot's sensors read (`_robot`), and what has happened (`_flags`);
     by default any flag ends an episode, and the reward is 1 where the first one holds. How episode i starts must be a
     pure function of (split, seed, i), as `torchdyn_plan.envs.episodes.draw_uniform` draws it: environments take the
     next index when they reset, so that the same actions give bit-identical episodes whatever ``num_envs``.
+
+    Actions are detached, and no tensor that is returned shares memory with the environment or with another entry: it
+    may be changed in place. `state_dict` holds where the series stands; an environment that loads it starts the
+    interrupted episodes again at its next reset, and goes on from there.
     """
 
     flags: ClassVar[tuple[str, ...]] = ()
@@ -58,10 +67,13 @@ class MovingTargetEnv(EnvBase):
         action_size: int,
         joints: int = 0,
         static_target: bool = False,
-        seed: int = 0,
+        seed: int | None = None,
         split: str = "train",
         history: int = 24,
         max_steps: int = 500,
+        goal_in_observation: bool = False,
+        render_mode: str | None = None,
+        device: torch.device | str = "cpu",
     ) -> None:
         """Declare the keys, with nothing started yet.
 
@@ -71,39 +83,50 @@ class MovingTargetEnv(EnvBase):
             action_size: size A of an action, each entry within ±1.
             joints: number of the robot's joints.
             static_target: the target rests, and `goal` says where.
-            seed: which series of episodes.
+            seed: which series of episodes, from its first one; None for series 0 from somewhere far into it, another
+                place at every call, so that copies made without a seed play different episodes.
             split: ``train``, ``dev`` or ``test``: series that never share an episode.
             history: length H of `target_history`, in control steps.
             max_steps: control steps after which an episode is truncated.
+            goal_in_observation: `observation` ends with the target's place (3) [m, world] and, unless it rests, with
+                its last step (3) [m]: for scripts that show a policy nothing but `observation`.
+            render_mode: ``rgb_array`` for pictures by `render`; None for none.
+            device: where entries are shown and actions are expected; the simulation stays on the CPU.
 
         Raises:
-            InputError: a number is negative, NaN or of the wrong kind, the split is unknown, or the class has no flags.
+            InputError: a number is negative, NaN or of the wrong kind, the split or the render mode is unknown, or the
+                class has no flags.
         """
         if not self.flags:
             raise InputError(f"{type(self).__name__}.flags must name at least what success is called")
         for name, value, minimum in (("num_envs", num_envs, 1), ("history", history, 2), ("max_steps", max_steps, 1)):
             check_number(name, value, minimum=minimum, integer=True)
-        check_number("seed", seed, minimum=0, integer=True)
         check_choice("split", split, SPLITS)
-        super().__init__(device=torch.device("cpu"), batch_size=torch.Size([num_envs]))
+        if render_mode is not None:
+            check_choice("render_mode", render_mode, RENDER_MODES)
+        super().__init__(device=torch.device(device), batch_size=torch.Size([num_envs]))
         self.static_target, self.history, self.max_steps = static_target, history, max_steps
-        self.seed, self.split = seed, split
-        self._next_episode = 0
+        self.split, self.goal_in_observation, self.render_mode = split, goal_in_observation, render_mode
+        self._begin_series(seed)
         self._episode = torch.zeros(num_envs, dtype=torch.int64)
         # TorchRL's StepCounter and CatFrames would do the next two, at several times the cost of a step.
         self._steps = torch.zeros(num_envs, dtype=torch.int64)
         self._trace = torch.zeros(num_envs, history, 3)
+        shown = 0 if not goal_in_observation else 3 if static_target else 6
         self.observation_spec = observation_spec(
             num_envs,
             joints=joints,
             state_size=state_size,
+            observation_size=state_size + shown,
             history=history,
             flags=self.flags,
             static_target=static_target,
-        )
-        self.action_spec = Bounded(-1.0, 1.0, shape=torch.Size((num_envs, action_size)))
-        self.reward_spec = Unbounded(torch.Size((num_envs, 1)))
-        self.done_spec = Composite({key: flag_spec(num_envs) for key in ENDS}, shape=(num_envs,))
+        ).to(self.device)
+        action = Bounded(-1.0, 1.0, shape=torch.Size((num_envs, action_size)), dtype=torch.float32)
+        self.action_spec = action.to(self.device)
+        self.reward_spec = Unbounded(torch.Size((num_envs, 1))).to(self.device)
+        ends = Composite({key: flag_spec(num_envs) for key in ENDS}, shape=(num_envs,))
+        self.done_spec = ends.to(self.device)
 
     @abstractmethod
     def _start(self, rows: Tensor, episodes: Tensor) -> Tensor:
@@ -120,6 +143,10 @@ class MovingTargetEnv(EnvBase):
     @abstractmethod
     def _flags(self) -> dict[str, Tensor]:
         """What has happened, bool ``(N,)`` for each of `flags`."""
+
+    def _picture(self, row: int, width: int, height: int) -> np.ndarray[Any, Any]:
+        """A picture of environment ``row`` now, ``(height, width, 3)`` uint8, of tasks that can draw themselves."""
+        raise InputError(f"{type(self).__name__} draws no pictures")
 
     def _reward(self, observed: TensorDict) -> Tensor:
         """Rewards ``(N, 1)`` of a step after which ``observed`` is seen: 1 where the first flag holds."""
@@ -143,6 +170,7 @@ class MovingTargetEnv(EnvBase):
         """Let the next reset take episode number ``episode``, and later ones the numbers after it."""
         check_number("episode", episode, minimum=0, integer=True)
         self._next_episode = episode
+        self._again.fill_(-1)
 
     @property
     def next_episode(self) -> int:
@@ -170,37 +198,87 @@ class MovingTargetEnv(EnvBase):
             self.check_planner(policy)
         return super().rollout(max_steps, policy, *args, **kwargs)
 
-    def _set_seed(self, seed: int | None) -> None:
-        """Start the series ``seed`` at its first episode."""
-        self.seed, self._next_episode = seed or 0, 0
+    def render(self, *, row: int | None = None, width: int = 320, height: int = 240) -> np.ndarray[Any, Any]:
+        """Pictures of all environments now, ``(N, height, width, 3)`` uint8, or of environment ``row`` without the N.
 
-    def _reset(self, tensordict: TensorDictBase | None = None, **_: Any) -> TensorDict:
+        Raises:
+            InputError: the environment was made without ``render_mode="rgb_array"``, there is no such row, or this
+                machine cannot draw.
+        """
+        if self.render_mode is None:
+            raise InputError("render needs an environment that was made with render_mode='rgb_array', got None")
+        if row is not None:
+            check_number("row", row, minimum=0, maximum=self.num_envs - 1, integer=True)
+            return self._picture(row, width, height)
+        return np.stack([self._picture(row, width, height) for row in range(self.num_envs)])
+
+    def get_extra_state(self) -> dict[str, Any]:
+        """Where the series stands, for `state_dict`: its seed, the episodes in progress, and the next one's number."""
+        return {"seed": self.seed, "next_episode": self._next_episode, "episodes": self._episode.clone()}
+
+    def set_extra_state(self, state: Any) -> None:
+        """Go on with the series of ``state``: the next reset starts the episodes that were in progress again.
+
+        Raises:
+            InputError: the state is of an environment with another number of episodes side by side.
+        """
+        check_trailing_shape("episodes of the state", state["episodes"], self.num_envs)
+        self.seed, self._next_episode = state["seed"], state["next_episode"]
+        self._again.copy_(state["episodes"])
+
+    def load_state_dict(self, state_dict: Any, *args: Any, **kwargs: Any) -> Any:
+        """As PyTorch's; an empty one, as a collector has of an environment that it does not ask, changes nothing."""
+        return super().load_state_dict(state_dict, *args, **kwargs) if state_dict else None
+
+    def _set_seed(self, seed: int | None) -> None:
+        """Start the series ``seed`` at its first episode; somewhere in series 0 for None."""
+        self._begin_series(seed)
+
+    def _begin_series(self, seed: int | None) -> None:
+        if seed is not None:
+            check_number("seed", seed, minimum=0, integer=True)
+        self.seed, self._next_episode = seed or 0, somewhere() if seed is None else 0
+        # Episodes that a row has to start again, as they were in progress when a state was saved; -1 for none.
+        self._again = torch.full((self.num_envs,), -1, dtype=torch.int64)
+
+    def _take_episodes(self, rows: Tensor) -> Tensor:
+        """Numbers of the episodes that ``rows`` (M,) start: ``(M,)``."""
+        episodes = self._again[rows]
+        new = (episodes < 0).nonzero().squeeze(-1)
+        episodes[new] = torch.arange(self._next_episode, self._next_episode + len(new))
+        self._next_episode += len(new)
+        self._again[rows] = -1
+        return episodes
+
+    def _reset(self, tensordict: TensorDictBase | None = None, **_: Any) -> TensorDictBase:
         mask = None if tensordict is None else tensordict.get("_reset", None)
-        rows = torch.arange(self.num_envs) if mask is None else mask.reshape(-1).nonzero().squeeze(-1)
+        rows = torch.arange(self.num_envs) if mask is None else mask.cpu().reshape(-1).nonzero().squeeze(-1)
         if len(rows):
-            episodes = torch.arange(self._next_episode, self._next_episode + len(rows))
-            self._next_episode += len(rows)
+            episodes = self._take_episodes(rows)
             self._episode[rows], self._steps[rows] = episodes, 0
-            # A copy: what an earlier step returned shares the old one.
-            self._trace = self._trace.clone()
             self._trace[rows] = self._start(rows, episodes).unsqueeze(1)
         result = self._observe()
         for key in ENDS:
             result[key] = torch.zeros(self.num_envs, 1, dtype=torch.bool)
-        return result
+        return self._shown(result)
 
-    def _step(self, tensordict: TensorDictBase) -> TensorDict:
+    def _step(self, tensordict: TensorDictBase) -> TensorDictBase:
         self._see(self._advance(self._checked_action(tensordict)))
         result = self._observe()
         terminated, truncated = self._terminated(result), self._is_over
         result["reward"] = self._reward(result)
         result["terminated"], result["truncated"], result["done"] = terminated, truncated, terminated | truncated
-        return result
+        return self._shown(result)
+
+    def _shown(self, result: TensorDict) -> TensorDictBase:
+        """``result`` where it is shown: the one move between devices."""
+        return result if self.device == result.device else result.to(self.device)
 
     def _checked_action(self, tensordict: TensorDictBase) -> Tensor:
         """The action (N, A); raises `InputError` where it has another shape or holds no number."""
         action = tensordict[keys.ACTION]
         check_trailing_shape(keys.ACTION, action, self.num_envs, self.action_spec.shape[-1])
+        action = action.detach().cpu()
         check_finite(keys.ACTION, action)
         return action
 
@@ -216,6 +294,8 @@ class MovingTargetEnv(EnvBase):
 
     def step_and_maybe_reset(self, tensordict: TensorDictBase) -> tuple[TensorDictBase, TensorDictBase]:
         """As TorchRL's, without its checks of every entry, which cost more than the step's own arithmetic."""
+        if tensordict.device != self.device:
+            tensordict = tensordict.to(self.device)
         after = self._step(tensordict)
         tensordict.set("next", after)
         entries = dict(tensordict.items()) | dict(after.items())
@@ -226,24 +306,29 @@ class MovingTargetEnv(EnvBase):
         return tensordict, TensorDict(entries, batch_size=self.batch_size, device=self.device)
 
     def _observe(self) -> TensorDict:
-        robot, target = self._robot(), self.target_pos
+        """What is seen now, on the CPU; every entry has a memory of its own."""
+        robot, history = self._robot(), self._trace.clone()
+        target = history[:, -1].clone()
+        observation = [robot.state]
+        if self.goal_in_observation:
+            observation += [target] if self.static_target else [target, target - history[:, -2]]
         entries = {
-            keys.TOOL_POS: robot.tool_pos,
+            keys.TOOL_POS: robot.tool_pos.clone(),
             keys.TARGET_POS: target,
-            keys.TARGET_HISTORY: self._trace,
-            keys.HISTORY_LENGTH: self._steps.clamp(max=self.history),
-            keys.ROBOT_STATE: robot.state,
-            keys.OBSERVATION: robot.state,
-            keys.ACHIEVED_GOAL: robot.tool_pos,
-            keys.DESIRED_GOAL: target,
-            keys.STEP_COUNT: self._steps.clone(),
+            keys.TARGET_HISTORY: history,
+            keys.HISTORY_LENGTH: (self._steps + 1).clamp(max=self.history),
+            keys.ROBOT_STATE: robot.state.clone(),
+            keys.OBSERVATION: torch.cat(observation, dim=-1),
+            keys.ACHIEVED_GOAL: robot.tool_pos.clone(),
+            keys.DESIRED_GOAL: target.clone(),
+            keys.STEP_COUNT: self._steps.unsqueeze(-1).clone(),
             keys.EPISODE: self._episode.clone(),
         }
         if robot.joint_pos is not None:
-            entries[keys.JOINT_POS] = robot.joint_pos
+            entries[keys.JOINT_POS] = robot.joint_pos.clone()
         if robot.joint_vel is not None:
-            entries[keys.JOINT_VEL] = robot.joint_vel
-        entries |= {key: flag.unsqueeze(-1) for key, flag in self._flags().items()}
+            entries[keys.JOINT_VEL] = robot.joint_vel.clone()
+        entries |= {key: flag.unsqueeze(-1).clone() for key, flag in self._flags().items()}
         if self.static_target:
-            entries[keys.GOAL] = target
-        return TensorDict(entries, batch_size=self.batch_size, device=self.device)
+            entries[keys.GOAL] = target.clone()
+        return TensorDict(entries, batch_size=self.batch_size, device=torch.device("cpu"))

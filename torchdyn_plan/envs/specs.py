@@ -16,7 +16,14 @@ def flag_spec(num_envs: int) -> Binary:
 
 
 def observation_spec(
-    num_envs: int, *, joints: int, state_size: int, history: int, flags: tuple[str, ...], static_target: bool
+    num_envs: int,
+    *,
+    joints: int,
+    state_size: int,
+    observation_size: int,
+    history: int,
+    flags: tuple[str, ...],
+    static_target: bool,
 ) -> Composite:
     """What is observed in ``num_envs`` environments; arguments as of `torchdyn_plan.envs.MovingTargetEnv`."""
     vectors: dict[str, tuple[int, ...]] = {
@@ -24,7 +31,7 @@ def observation_spec(
         keys.TARGET_POS: (3,),
         keys.TARGET_HISTORY: (history, 3),
         keys.ROBOT_STATE: (state_size,),
-        keys.OBSERVATION: (state_size,),
+        keys.OBSERVATION: (observation_size,),
         keys.ACHIEVED_GOAL: (3,),
         keys.DESIRED_GOAL: (3,),
     }
@@ -33,8 +40,9 @@ def observation_spec(
     if static_target:
         vectors[keys.GOAL] = (3,)
     specs: dict[str, Any] = {key: Unbounded(torch.Size((num_envs, *shape))) for key, shape in vectors.items()}
-    for key in (keys.HISTORY_LENGTH, keys.STEP_COUNT, keys.EPISODE):
+    for key in (keys.HISTORY_LENGTH, keys.EPISODE):
         specs[key] = Unbounded(torch.Size((num_envs,)), dtype=torch.int64)
+    specs[keys.STEP_COUNT] = Unbounded(torch.Size((num_envs, 1)), dtype=torch.int64)
     for key in flags:
         specs[key] = flag_spec(num_envs)
     return Composite(specs, shape=(num_envs,))

@@ -75,7 +75,7 @@ class EpisodeLog:
         counts[counts.clone()] = ~self.done[episode[counts]]
         rows = (noted & counts).nonzero().squeeze(-1)
         first = rows[success[rows] & (self.steps[episode[rows]] < 0)]
-        self.steps[episode[first]] = after[keys.STEP_COUNT][first]
+        self.steps[episode[first]] = after[keys.STEP_COUNT].squeeze(-1)[first]
         ended = rows[done[rows]]
         if len(ended):
             self._end(stepped, ended)

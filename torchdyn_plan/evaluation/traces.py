@@ -43,7 +43,7 @@ class TraceLog:
     def add(self, stepped: TensorDictBase) -> None:
         """Take in one step of all environments, before it was acted."""
         tool_pos: Tensor = stepped.get(keys.TOOL_POS)
-        step: Tensor = stepped.get(keys.STEP_COUNT)
+        step: Tensor = stepped.get(keys.STEP_COUNT).squeeze(-1)
         if len(self._record) != len(step):
             self._record = torch.empty(len(step), self._max_steps + 1, 12)
             self._rows = torch.arange(len(step))
@@ -60,7 +60,7 @@ class TraceLog:
     def end(self, stepped: TensorDictBase, rows: Tensor) -> None:
         """Put the episodes of environments ``rows`` (R,) away, which end with this step."""
         after: TensorDictBase = stepped.get("next")
-        length = after[keys.STEP_COUNT][rows]
+        length = after[keys.STEP_COUNT].squeeze(-1)[rows]
         record = self._record[rows]
         last = torch.cat([after[keys.TOOL_POS][rows], after[keys.TARGET_POS][rows]], dim=-1)
         record[torch.arange(len(rows)), length, :6] = last.to(record.dtype)

@@ -17,7 +17,7 @@ TABLE = (*keys.KEYS, *KEYS)
 
 
 def make_env(num_envs=2, **settings):
-    return DynamicReachEnv(num_envs, **{"num_threads": 1, **settings})
+    return DynamicReachEnv(num_envs, **{"num_threads": 1, "seed": 0, **settings})
 
 
 def towards(td, place):
@@ -65,8 +65,8 @@ def test_goals_go_their_way_from_the_first_step_on(motion):
     for step in range(12):
         index = (torch.arange(5) + step - 4).clamp_min(0)
         assert torch.equal(rollout["target_history"][:, step], seen[:, index])
-        assert rollout["history_length"][:, step].tolist() == [min(step, 5)] * 4
-        assert rollout["step_count"][:, step].tolist() == [step] * 4
+        assert rollout["history_length"][:, step].tolist() == [min(step + 1, 5)] * 4
+        assert rollout["step_count"][:, step].tolist() == [[step]] * 4
 
 
 def test_a_goal_waits_while_the_gripper_is_at_it_and_goes_on_when_it_leaves():
@@ -111,7 +111,7 @@ def test_reward_is_one_function_for_step_and_hindsight():
 @pytest.mark.parametrize(("first", "num_envs", "threads"), [(0, 16, 2), (3, 7, 1), (12, 4, 2)])
 def test_the_same_actions_give_bit_identical_episodes(first, num_envs, threads):
     def wave(td):
-        phase = 0.1 * td["step_count"] + td["episode"]
+        phase = 0.1 * td["step_count"].squeeze(-1) + td["episode"]
         td["action"] = torch.sin(phase.unsqueeze(-1) + torch.arange(4))
         return td
 
@@ -127,7 +127,7 @@ def test_resets_of_some_rows_leave_the_others_alone():
     env = make_env(3)
     td = env.rollout(5)[:, -1]["next"].exclude("reward")
     again = env.reset(td.clone().set("_reset", torch.tensor([[False], [True], [False]])))
-    assert again["step_count"].tolist() == [5, 0, 5]
+    assert again["step_count"].tolist() == [[5], [0], [5]]
     assert again["episode"].tolist() == [0, 3, 2]
     assert torch.equal(again["tool_pos"][[0, 2]], td["tool_pos"][[0, 2]])
 

@@ -26,7 +26,7 @@ def straight_down():
 
 
 def make_env(num_envs=2, **settings):
-    return TrapperEnv(num_envs, **{"num_threads": 1, **settings})
+    return TrapperEnv(num_envs, **{"num_threads": 1, "seed": 0, **settings})
 
 
 @pytest.mark.parametrize("settings", [{}, {"static_target": True, "history": 5, "num_envs": 1}])
@@ -66,8 +66,8 @@ def test_history_is_padded_with_the_first_sample_and_slides():
     for step in range(12):
         index = (torch.arange(5) + step - 4).clamp_min(0)
         assert torch.equal(rollout["target_history"][:, step], path[:, index])
-        assert rollout["history_length"][:, step].tolist() == [min(step, 5)] * 2
-        assert rollout["step_count"][:, step].tolist() == [step] * 2
+        assert rollout["history_length"][:, step].tolist() == [min(step + 1, 5)] * 2
+        assert rollout["step_count"][:, step].tolist() == [[step]] * 2
 
 
 def test_truncation_comes_at_the_last_step_and_not_before():
@@ -189,7 +189,7 @@ def test_a_start_before_the_first_episode_is_refused():
 
 def test_a_planner_of_another_scene_is_refused_before_anything_moves():
     other = TrapperScene(table_side=1.4)
-    env, planner = TrapperEnv(2, scene=other, num_threads=1), TargetPursuit(ik_planner(), scene=SCENE.digest())
+    env, planner = TrapperEnv(2, scene=other, seed=0, num_threads=1), TargetPursuit(ik_planner(), scene=SCENE.digest())
     for call in (lambda: env.check_planner(planner), lambda: env.rollout(3, planner)):
         with pytest.raises(InputError, match=f"belongs to scene {SCENE.digest()}.*scene is {other.digest()}"):
             call()

@@ -15,7 +15,7 @@ SCENE = TrapperScene()
 
 
 def make_env(num_envs=2, **settings):
-    return TrapperEnv(num_envs, **{"num_threads": 1, **settings})
+    return TrapperEnv(num_envs, **{"num_threads": 1, "seed": 0, **settings})
 
 
 def same(one, other):
@@ -24,7 +24,7 @@ def same(one, other):
 
 def wave(td):
     """Actions that are a function of episode and step alone."""
-    phase = 0.1 * td["step_count"] + td["episode"]
+    phase = 0.1 * td["step_count"].squeeze(-1) + td["episode"]
     td["action"] = torch.sin(phase.unsqueeze(-1) + torch.arange(6))
     return td
 
@@ -78,7 +78,7 @@ def test_a_partial_reset_resets_the_masked_rows_alone_and_takes_the_next_episode
     before = td.clone()
     reset = env.reset(td.clone().set("_reset", torch.tensor([[False], [True], [False], [True]])))
     assert reset["episode"].tolist() == [0, 4, 2, 5]
-    assert reset["step_count"].tolist() == [6, 0, 6, 0]
+    assert reset["step_count"].tolist() == [[6], [0], [6], [0]]
     assert same(reset[[0, 2]].select(*before.keys()), before[[0, 2]])
     fresh = make_env(2)
     fresh.start_from(4)

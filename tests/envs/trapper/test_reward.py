@@ -8,6 +8,7 @@ from torch import Tensor
 
 from torchdyn_plan import keys
 from torchdyn_plan.envs.trapper.goal_env import TrapperGoalEnv
+from torchdyn_plan.envs.trapper.keys import TOOL_ROTATION
 from torchdyn_plan.envs.trapper.reward import GoalReward, goal_reward, resting_ball
 from torchdyn_plan.envs.trapper.scene import TrapperScene
 from torchdyn_plan.errors import InputError
@@ -94,11 +95,15 @@ def test_step_and_hindsight_agree_on_real_rollouts() -> None:
     assert torch.equal(task.reward(shuffled), shuffled["next", "reward"])
 
 
-def test_a_changed_goal_counts_from_the_next_step_on() -> None:
+def test_a_changed_goal_is_shown_before_it_is_paid_for() -> None:
+    """What a policy is shown is what it is paid for, and what it will be shown next is in ``next``."""
     env = TrapperGoalEnv(8, seed=1, max_steps=60, period=5, num_threads=1)
     rollout = env.rollout(60, break_when_any_done=False)
     goal, after = rollout[keys.DESIRED_GOAL], rollout["next", keys.DESIRED_GOAL]
-    assert torch.equal(goal, after), "a transition has one goal"
+    assert torch.equal(after[:, :-1], goal[:, 1:])
+    tool = rollout["next", keys.TOOL_POS], rollout["next", TOOL_ROTATION]
+    assert torch.equal(rollout["next", "reward"], goal_reward(SCENE, GoalReward(), *tool, goal))
+    assert not torch.equal(rollout["next", "reward"], goal_reward(SCENE, GoalReward(), *tool, after))
     changes = (goal[:, 1:] != goal[:, :-1]).any(-1)
     assert changes.any(-1).all()
     low = goal[..., 2] == SCENE.ball_radius

@@ -128,7 +128,7 @@ def test_a_bad_chunk_is_refused(chunk):
 
 
 def test_memory_survives_resets_at_different_moments():
-    env, planner, rows = TrapperEnv(3, num_threads=1, velocity=0.5), TargetPursuit(ik_planner(chunk=4)), []
+    env, planner, rows = TrapperEnv(3, seed=0, num_threads=1, velocity=0.5), TargetPursuit(ik_planner(chunk=4)), []
     td = env.reset()
     for step in range(40):
         if step in (7, 20, 21):
@@ -140,7 +140,7 @@ def test_memory_survives_resets_at_different_moments():
     for row in data.unbind(0):
         for episode in row["episode"].unique().tolist():
             part = row[row["episode"] == episode]
-            alone = TrapperEnv(1, num_threads=1, velocity=0.5)
+            alone = TrapperEnv(1, seed=0, num_threads=1, velocity=0.5)
             alone.start_from(episode)
             expected = alone.rollout(len(part), planner)[0]
             for key in ("action", "goal", ("plan", "path_pos"), ("plan", "path_step"), ("next", "joint_pos")):

@@ -76,7 +76,7 @@ def test_the_recorded_future_is_what_happens():
     from torchdyn_plan.envs import DynamicReachEnv
     from torchdyn_plan.envs.fetch_reach.goal_motion import draw_goals
 
-    env = DynamicReachEnv(3, velocity=0.05, motion="circle", split="dev", num_threads=1)
+    env = DynamicReachEnv(3, velocity=0.05, motion="circle", split="dev", seed=0, num_threads=1)
     start = env.simulation.start.tool_pos
     starts = draw_goals(torch.arange(3), start, motion="circle", goal_range=0.1, split="dev", seed=0)
     path = goal_path(starts, 10, motion="circle", velocity=0.05)

@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+from typing import Any
+
+import numpy as np
 import torch
 from tensordict import TensorDict
 from torch import Tensor
@@ -11,6 +14,7 @@ from torchdyn_plan.envs.fetch_reach.goal_motion import MOTIONS, GoalStarts, draw
 from torchdyn_plan.envs.fetch_reach.keys import REACHED
 from torchdyn_plan.envs.fetch_reach.simulation import ARM_JOINTS, FetchSimulation, fetch_digest
 from torchdyn_plan.envs.moving_target import MovingTargetEnv, RobotReading
+from torchdyn_plan.envs.painter import Painter, Sphere
 
 MAX_STEPS = 50
 """Control steps of an episode: two seconds."""
@@ -33,7 +37,7 @@ def reach_reward(tool_pos: Tensor, goal: Tensor, *, threshold: float = THRESHOLD
 
 
 class DynamicReachEnv(MovingTargetEnv):
-    """N independent episodes of reaching a moving goal, ``batch_size [num_envs]``, on the CPU; as in DHER.
+    """N independent episodes of reaching a moving goal, ``batch_size [num_envs]``; as in DHER.
 
     The order of a step is DHER's (Fang et al., ICLR 2019): first the goal moves by ``velocity``, but not while the
     gripper is at it; then the action and the physics; then reward and observation. The reward is 0 at the goal and -1
@@ -54,11 +58,14 @@ class DynamicReachEnv(MovingTargetEnv):
         static_target: bool = False,
         threshold: float = THRESHOLD,
         goal_range: float | None = None,
-        seed: int = 0,
+        seed: int | None = None,
         split: str = "train",
         history: int = 8,
         max_steps: int = MAX_STEPS,
         num_threads: int = 0,
+        goal_in_observation: bool = False,
+        render_mode: str | None = None,
+        device: torch.device | str = "cpu",
     ) -> None:
         """Build the batch.
 
@@ -70,11 +77,14 @@ class DynamicReachEnv(MovingTargetEnv):
             threshold: distance from the goal that counts as being there [m].
             goal_range: goals on lines start within this of the gripper along each axis [m]; 0.1 as in DHER, and 0.15
                 as in FetchReach for ``static_target``.
-            seed: which series of episodes.
+            seed: which series of episodes; None for another place in series 0 at every call.
             split: ``train``, ``dev`` or ``test``: series that never share an episode.
             history: length H of `target_history`, in control steps.
             max_steps: control steps after which an episode is truncated.
             num_threads: native threads of the simulation, 0 for all cores.
+            goal_in_observation: `observation` ends with the goal's place and, if it moves, with its last step.
+            render_mode: ``rgb_array`` for pictures by `render`.
+            device: where entries are shown and actions are expected; the simulation stays on the CPU.
 
         Raises:
             InputError: a number is negative, NaN or of the wrong kind, the split or the motion is unknown, or
@@ -96,6 +106,9 @@ class DynamicReachEnv(MovingTargetEnv):
             split=split,
             history=history,
             max_steps=max_steps,
+            goal_in_observation=goal_in_observation,
+            render_mode=render_mode,
+            device=device,
         )
         self.scene_digest = fetch_digest()
         self.velocity, self.motion = 0.0 if static_target else velocity, motion
@@ -103,6 +116,7 @@ class DynamicReachEnv(MovingTargetEnv):
         self.simulation = FetchSimulation(num_envs, num_threads=num_threads)
         self._moves = torch.zeros(num_envs, dtype=torch.int64)
         self._reached = torch.zeros(num_envs, dtype=torch.bool)
+        self._painter: Painter | None = None
         place = torch.zeros(num_envs, 3, dtype=torch.float64)
         self._starts = GoalStarts(place, torch.zeros(num_envs, dtype=torch.float64))
 
@@ -121,8 +135,6 @@ class DynamicReachEnv(MovingTargetEnv):
             old[rows] = new
         self._moves[rows] = 0
         self._goal = self._places()
-        # A copy: what an earlier step returned shares the old one.
-        self._reached = self._reached.clone()
         self._reached[rows] = False
         return self._goal[rows].float()
 
@@ -152,3 +164,9 @@ class DynamicReachEnv(MovingTargetEnv):
 
     def _flags(self) -> dict[str, Tensor]:
         return {REACHED: self._reached}
+
+    def _picture(self, row: int, width: int, height: int) -> np.ndarray[Any, Any]:
+        if self._painter is None:
+            self._painter = Painter(self.simulation.model, lookat=(1.1, 0.75, 0.5), distance=1.8, azimuth=130.0)
+        goal = Sphere(tuple(self._goal[row].tolist()), radius=0.02, colour=(0.9, 0.1, 0.1, 1.0))
+        return self._painter.picture(self.simulation.qpos[row].numpy(), width, height, [goal])

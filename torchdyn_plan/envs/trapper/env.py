@@ -2,12 +2,16 @@
 
 from __future__ import annotations
 
+from typing import Any
+
+import numpy as np
 import torch
 from tensordict import TensorDict
 from torch import Tensor, nn
 
 from torchdyn_plan.checks import check_number
 from torchdyn_plan.envs.moving_target import MovingTargetEnv, RobotReading
+from torchdyn_plan.envs.painter import Painter, Sphere
 from torchdyn_plan.envs.trapper.contact import is_covered, is_pocketed
 from torchdyn_plan.envs.trapper.keys import POCKETED, TRAPPED
 from torchdyn_plan.envs.trapper.reward import GoalReward, goal_reward
@@ -26,7 +30,7 @@ ROWS = 64
 
 
 class TrapperEnv(MovingTargetEnv):
-    """N independent Trapper episodes, ``batch_size [num_envs]``, on the CPU; keys as in `torchdyn_plan.keys`.
+    """N independent Trapper episodes, ``batch_size [num_envs]``; keys as in `torchdyn_plan.keys`.
 
     An episode is `terminated` when the ball is trapped (covered, and kept for `HOLD_STEPS` steps) or pocketed, and
     `truncated` after ``max_steps`` control steps. The reward is 1 in the step that traps the ball and 0 elsewhere.
@@ -45,13 +49,16 @@ class TrapperEnv(MovingTargetEnv):
         velocity: float = 3.0,
         friction: float = 0.0,
         static_target: bool = False,
-        seed: int = 0,
+        seed: int | None = None,
         split: str = "train",
         scene: TrapperScene | None = None,
         history: int = 24,
         max_steps: int = MAX_STEPS,
         weights: GoalReward | None = None,
         num_threads: int = 0,
+        goal_in_observation: bool = False,
+        render_mode: str | None = None,
+        device: torch.device | str = "cpu",
     ) -> None:
         """Build the batch.
 
@@ -60,16 +67,19 @@ class TrapperEnv(MovingTargetEnv):
             velocity: speed of the ball at the start [m/s].
             friction: friction loss on the ball's horizontal translation [N].
             static_target: the ball lies still, and `goal` is where it lies.
-            seed: which series of episodes.
+            seed: which series of episodes; None for another place in series 0 at every call.
             split: ``train``, ``dev`` or ``test``: series that never share an episode.
             scene: geometry and physics; the calibrated scene by default.
             history: length H of `target_history`, in control steps.
             max_steps: control steps after which an episode is truncated.
             weights: of the terms of the reward with ``static_target``.
             num_threads: native threads of the simulation, 0 for all cores.
+            goal_in_observation: `observation` ends with the ball's place and, if it rolls, with its last step.
+            render_mode: ``rgb_array`` for pictures by `render`.
+            device: where entries are shown and actions are expected; the simulation stays on the CPU.
 
         Raises:
-            InputError: a number is negative, NaN or of the wrong kind, or the split is unknown.
+            InputError: a number is negative, NaN or of the wrong kind, or the split or the render mode is unknown.
         """
         check_number("velocity", velocity, minimum=0.0, maximum=20.0)
         check_number("friction", friction, minimum=0.0)
@@ -83,6 +93,9 @@ class TrapperEnv(MovingTargetEnv):
             split=split,
             history=history,
             max_steps=max_steps,
+            goal_in_observation=goal_in_observation,
+            render_mode=render_mode,
+            device=device,
         )
         self.scene, self.weights = scene or TrapperScene(), weights or GoalReward()
         self.scene_digest = self.scene.digest()
@@ -93,16 +106,14 @@ class TrapperEnv(MovingTargetEnv):
         self._held = torch.zeros(num_envs, dtype=torch.int64)
         home = torch.tensor(self.scene.home, dtype=torch.float64)
         self._tool_pos, self._tool_rotation = self._tool(home.expand(num_envs, -1))
-        self._home_tool_pos = self._tool_pos[0]
-        self._tool_pos = self._home_tool_pos.repeat(num_envs, 1)
+        self._home_tool = self._tool_pos[0].clone(), self._tool_rotation[0].clone()
+        self._painter: Painter | None = None
 
     def _start(self, rows: Tensor, episodes: Tensor) -> Tensor:
         place, speed = draw_starts(self.scene, episodes, velocity=self.velocity, split=self.split, seed=self.seed)
         self.simulation.reset(rows, place, speed)
         self._held[rows] = 0
-        # A copy: what an earlier step returned shares the old one.
-        self._tool_pos = self._tool_pos.clone()
-        self._tool_pos[rows] = self._home_tool_pos
+        self._tool_pos[rows], self._tool_rotation[rows] = self._home_tool
         return self.simulation.ball_pos[rows].float()
 
     def _advance(self, action: Tensor) -> Tensor:
@@ -135,3 +146,12 @@ class TrapperEnv(MovingTargetEnv):
 
     def _flags(self) -> dict[str, Tensor]:
         return {TRAPPED: self._held >= HOLD_STEPS, POCKETED: is_pocketed(self.scene, self._trace[:, -1])}
+
+    def _picture(self, row: int, width: int, height: int) -> np.ndarray[Any, Any]:
+        if self._painter is None:
+            self._painter = Painter(self.simulation.model, lookat=(0.0, 0.0, -0.1), distance=2.7, azimuth=150.0)
+        return self._painter.picture(self.simulation.qpos[row].numpy(), width, height, self._marks(row))
+
+    def _marks(self, row: int) -> list[Sphere]:
+        """What a picture of environment ``row`` shows beside the scene."""
+        return []

@@ -6,16 +6,16 @@ from typing import Any
 
 import numpy as np
 import torch
-from tensordict import TensorDict, TensorDictBase
+from tensordict import TensorDict
 from torch import Tensor
 from torchrl.data import Unbounded
 
-from torchdyn_plan import keys
 from torchdyn_plan.checks import check_number
 from torchdyn_plan.envs.episodes import episode_random
+from torchdyn_plan.envs.painter import Sphere
 from torchdyn_plan.envs.trapper.env import TrapperEnv
-from torchdyn_plan.envs.trapper.keys import TOOL_ROTATION
-from torchdyn_plan.envs.trapper.reward import GoalReward, goal_reward
+from torchdyn_plan.envs.trapper.keys import REACHED, TOOL_ROTATION
+from torchdyn_plan.envs.trapper.reward import GoalReward, goal_reward, is_goal_reached
 from torchdyn_plan.envs.trapper.scene import TrapperScene
 
 WITHIN_REACH = (0.22, 0.93)
@@ -29,12 +29,15 @@ KEPT = (0.25, 1.0)
 
 
 class TrapperGoalEnv(TrapperEnv):
-    """N arms with a goal each, ``desired_goal`` (N, 3) [m, world], on the table or above it, that changes at times.
+    """N arms with a goal each, on the table or above it, that changes at times: the goal is the target.
 
-    An action holds for ``period`` control steps. The reward is `goal_reward` at their end, for the goal that was in
-    force; ``next`` keeps that goal, and a new one is seen from the following step on. Episodes are never `terminated`.
-    Goals and the moments when they change are a pure function of (split, seed, episode).
+    An action holds for ``period`` control steps. The reward is `goal_reward` at their end for the goal that was in
+    force, the one that the action was chosen for; what is seen then, ``next`` among it, shows the goal of the step to
+    come. Episodes are never `terminated`. Goals and the moments when they change are a pure function of (split, seed,
+    episode).
     """
+
+    flags = (REACHED,)
 
     def __init__(
         self,
@@ -54,7 +57,7 @@ class TrapperGoalEnv(TrapperEnv):
             weights: of the reward's terms.
             max_steps: actions after which an episode is truncated.
             redirected: goals change in mid-episode; else each episode has one.
-            **kw: as for `TrapperEnv`: split, seed, scene and num_threads.
+            **kw: as for `TrapperEnv`: split, seed, scene, history, num_threads and how entries are shown.
         """
         check_number("period", period, minimum=1, integer=True)
         super().__init__(num_envs, static_target=True, max_steps=max_steps, weights=weights, **kw)
@@ -64,54 +67,45 @@ class TrapperGoalEnv(TrapperEnv):
             shortest, longest = (max(1, round(seconds / (period * self.scene.control_step))) for seconds in KEPT)
             self._kept = (shortest, longest)
         self._goals = torch.zeros(num_envs, max_steps + 1, 3)
-        self.observation_spec[TOOL_ROTATION] = Unbounded(torch.Size((num_envs, 3, 3)))
+        self._sought = torch.zeros(num_envs, 3)
+        rotation = Unbounded(torch.Size((num_envs, 3, 3)), dtype=torch.float32)
+        self.observation_spec[TOOL_ROTATION] = rotation.to(self.device)
 
-    def _reset(self, tensordict: TensorDictBase | None = None, **kw: Any) -> TensorDict:
-        before = self._next_episode
-        result = super()._reset(tensordict, **kw)
-        rows = (self._episode >= before) & (self._steps == 0)
-        rows = rows.nonzero().squeeze(-1)
-        if len(rows):
-            far = torch.tensor([0.0, self.scene.half_side - 2 * self.scene.ball_radius], dtype=torch.float64)
-            self.simulation.ball_pos[rows, :2] = far
-            self._goals = self._goals.clone()
-            self._goals[rows] = draw_goal_sequences(
-                self.scene,
-                self._episode[rows],
-                steps=self._goals.shape[1],
-                kept=self._kept,
-                split=self.split,
-                seed=self.seed,
-            )
-        result[TOOL_ROTATION] = self._tool(self.simulation.joint_pos)[1]
-        return self._with_goal(result, self._steps)
+    def _start(self, rows: Tensor, episodes: Tensor) -> Tensor:
+        super()._start(rows, episodes)
+        far = torch.tensor([0.0, self.scene.half_side - 2 * self.scene.ball_radius], dtype=torch.float64)
+        self.simulation.ball_pos[rows, :2] = far
+        self._goals[rows] = draw_goal_sequences(
+            self.scene, episodes, steps=self._goals.shape[1], kept=self._kept, split=self.split, seed=self.seed
+        )
+        self._sought[rows] = self._goals[rows, 0]
+        return self._goals[rows, 0]
 
-    def _step(self, tensordict: TensorDictBase) -> TensorDict:
-        action = self._checked_action(tensordict)
+    def _advance(self, action: Tensor) -> Tensor:
         for _ in range(self.period):
             self.simulation.step(action)
-        goal = self._goal_at(self._steps)
-        self._steps += 1
-        self._tool_pos, rotation = self._tool(self.simulation.joint_pos)
-        result, truncated = self._observe(), self._is_over
-        result[keys.DESIRED_GOAL] = result[keys.GOAL] = goal
-        result[TOOL_ROTATION] = rotation
-        result["reward"] = goal_reward(self.scene, self.weights, self._tool_pos, rotation, goal)
-        result["terminated"] = torch.zeros_like(truncated)
-        result["truncated"], result["done"] = truncated, truncated.clone()
-        return result
-
-    def step_and_maybe_reset(self, tensordict: TensorDictBase) -> tuple[TensorDictBase, TensorDictBase]:
-        """As `TrapperEnv`'s; the carried-over observation shows the goal of the step to come."""
-        tensordict, after = super().step_and_maybe_reset(tensordict)
-        return tensordict, self._with_goal(after, self._steps)
+        self._tool_pos, self._tool_rotation = self._tool(self.simulation.joint_pos)
+        self._sought = self._goal_at(self._steps)
+        return self._goal_at(self._steps + 1)
 
     def _goal_at(self, steps: Tensor) -> Tensor:
         return self._goals[torch.arange(self.num_envs), steps.clamp(max=self._goals.shape[1] - 1)]
 
-    def _with_goal(self, result: Any, steps: Tensor) -> Any:
-        result[keys.DESIRED_GOAL] = result[keys.GOAL] = self._goal_at(steps)
-        return result
+    def _observe(self) -> TensorDict:
+        return super()._observe().set(TOOL_ROTATION, self._tool_rotation.clone())
+
+    def _reward(self, observed: TensorDict) -> Tensor:
+        return goal_reward(self.scene, self.weights, self._tool_pos, self._tool_rotation, self._sought)
+
+    def _terminated(self, observed: TensorDict) -> Tensor:
+        return torch.zeros(self.num_envs, 1, dtype=torch.bool)
+
+    def _flags(self) -> dict[str, Tensor]:
+        tool = self._tool_pos, self._tool_rotation
+        return {REACHED: is_goal_reached(self.scene, self.weights, *tool, self._sought)}
+
+    def _marks(self, row: int) -> list[Sphere]:
+        return [Sphere(tuple(self.target_pos[row].tolist()), self.scene.ball_radius, (0.9, 0.1, 0.1, 0.5))]
 
 
 def draw_goal_sequences(

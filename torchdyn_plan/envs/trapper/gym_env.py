@@ -29,7 +29,7 @@ class TrapperGymEnv(gymnasium.Env[Observation, np.ndarray[Any, Any]]):
     there. `compute_reward` is vectorised over leading dimensions, and the same function as `TrapperGoalEnv`'s.
     """
 
-    def __init__(self, *, seed: int = 0, **settings: Any) -> None:
+    def __init__(self, *, seed: int | None = None, **settings: Any) -> None:
         """Build an environment with the arguments of `TrapperGoalEnv`."""
         super().__init__()
         self.env = TrapperGoalEnv(1, seed=seed, redirected=False, **settings)

@@ -53,19 +53,27 @@ def goal_reward(
     Returns:
         ``(*B, 1)``.
     """
-    on_table = is_on_table(scene, goal)
-    ball = resting_ball(scene, goal)
+    reached = is_goal_reached(scene, weights, tool_pos, tool_rotation, goal)
     away = (goal - tool_pos).norm(dim=-1)
-    above = (away <= weights.tolerance) & (tool_rotation[..., 2, 2] < UPRIGHT)
-    centred = (goal - tool_pos)[..., :2].abs().amax(-1) <= weights.tolerance
-    reached = torch.where(on_table, centred & is_covered(scene, tool_pos, tool_rotation, ball), above)
     tilt = torch.arccos((-tool_rotation[..., 2, 2]).clamp(-1.0, 1.0))
     upright = (1.0 - 2.0 * (tilt / (math.pi / 3)).square()).clamp_min(-1.0)
     near = weights.alignment / (1.0 + (away / weights.alignment_range).square())
     reward = reached + near * upright
     if weights.touch:
-        reward = reward - weights.touch * (on_table & is_in_the_way(scene, tool_pos, tool_rotation, ball))
+        touched = is_in_the_way(scene, tool_pos, tool_rotation, resting_ball(scene, goal))
+        reward = reward - weights.touch * (is_on_table(scene, goal) & touched)
     return reward.unsqueeze(-1)
+
+
+def is_goal_reached(
+    scene: TrapperScene, weights: GoalReward, tool_pos: Tensor, tool_rotation: Tensor, goal: Tensor
+) -> Tensor:
+    """1(box == g) of `goal_reward`, whose arguments these are: ``(*B,)`` bool."""
+    away = (goal - tool_pos).norm(dim=-1)
+    above = (away <= weights.tolerance) & (tool_rotation[..., 2, 2] < UPRIGHT)
+    centred = (goal - tool_pos)[..., :2].abs().amax(-1) <= weights.tolerance
+    covered = is_covered(scene, tool_pos, tool_rotation, resting_ball(scene, goal))
+    return torch.where(is_on_table(scene, goal), centred & covered, above)
 
 
 UPRIGHT = -math.cos(math.radians(15.0))
