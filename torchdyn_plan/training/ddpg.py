@@ -95,7 +95,7 @@ class DDPG:
         if not episodes["next", "done"][..., -1, :].all():
             raise TrainingError(f"episodes must end after {self.task.length} actions, and some did not")
         read = [*SEEN, keys.ACTION, *(("next", key) for key in (*SEEN, keys.ACHIEVED_GOAL, "reward", "done"))]
-        self.replay.extend_episodes(episodes.select(*read, ("next", "terminated"), *self.task.stored))
+        self.replay.extend(episodes.select(*read, ("next", "terminated"), *self.task.stored))
         return {"reward": float(episodes["next", "reward"].mean())}
 
     def standardise(self) -> None:
