@@ -283,7 +283,7 @@ def test_threads_are_set_for_the_run_alone(tmp_path):
     assert torch.get_num_threads() == before
 
 
-def test_planners_stay_as_they_were(planner):
+def test_planners_stay_as_they_were():
     made = untrained(TASK.static_planner()).train()
     bench(made, batches=(1,), **QUICK)
     assert made.training
