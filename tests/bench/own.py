@@ -30,8 +30,8 @@ def make_planner(**parts):
     return DynamicPlanner(CallablePlanner(stand_still), straight_on, always_forty, **parts)
 
 
-def chase(tensordict):
-    """A planner that is a function of a tensordict."""
+def stand_on_tensordict(tensordict):
+    """A planner, for static goals or moving targets, that is a function of a tensordict."""
     return tensordict.set(keys.ACTION, torch.zeros(*tensordict.batch_size, 6))
 
 

@@ -24,7 +24,14 @@ def test_default_planners_are_those_of_the_task_that_plan_on_what_is_seen():
 
 def test_a_planner_is_found_by_name_in_a_folder_or_at_a_place(tmp_path):
     TASK.planner("exact").save_pretrained(tmp_path / "mine")
-    names = ["corner", "ik", "trapper-rl", str(tmp_path / "mine"), "tests.bench.own:PLANNER", "tests.bench.own:chase"]
+    names = [
+        "corner",
+        "ik",
+        "trapper-rl",
+        str(tmp_path / "mine"),
+        "tests.bench.own:PLANNER",
+        "tests.bench.own:stand_on_tensordict",
+    ]
     found = Source().choose(names)
     assert list(found) == names
     planners = [one.planner for one in found.values()]
@@ -32,10 +39,10 @@ def test_a_planner_is_found_by_name_in_a_folder_or_at_a_place(tmp_path):
     assert planners[2].static.__class__.__name__ == "PolicyPlanner"
     assert planners[3].search == TASK.planner("exact").search
     assert planners[4] is own.PLANNER
-    assert planners[5] is own.chase
+    assert planners[5] is own.stand_on_tensordict
     assert Source().choose("corner").keys() == {"corner"}
     assert Source().choose(own.PLANNER)["planner"].planner is own.PLANNER
-    assert Source().choose({"a": own.PLANNER, "b": own.chase})["b"].planner is own.chase
+    assert Source().choose({"a": own.PLANNER, "b": own.stand_on_tensordict})["b"].planner is own.stand_on_tensordict
 
 
 def test_a_place_may_make_a_planner_of_nothing(monkeypatch):

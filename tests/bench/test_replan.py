@@ -141,6 +141,42 @@ def test_parts_that_planners_share_are_measured_once(planner):
     assert parts == {"forecast", "ETA, 1 goal", "ETA, 1 goal, own", "static planner's step"}
 
 
+def test_a_planner_that_has_no_copy_for_inference_is_measured_as_it_is(planner):
+    class Own(DynamicPlanner):
+        def __init__(self, gain):
+            super().__init__(own.stand_on_tensordict, own.straight_on, own.always_forty, search=own.meet_in_hundred)
+            self.gain = gain
+
+    rows = bench({"own": Own(1.0), "other": planner}, batches=(1,), **QUICK)
+    failed = [row for row in rows if "error" in row]
+    assert {(row["what"], row["implementation"]) for row in failed} >= {
+        ("re-plan, own", "torchdyn_plan, for inference")
+    }
+    assert all(row["implementation"] == "torchdyn_plan, for inference" for row in failed)
+    assert all("unexpected keyword argument" in row["error"] for row in failed)
+    assert {"re-plan, own", "step that plans, own", "re-plan, other"} <= whats(row for row in rows if row not in failed)
+
+
+@pytest.mark.parametrize("dtype", [torch.bfloat16, torch.float64])
+def test_equal_weights_are_one_part_in_any_type_of_numbers(dtype):
+    made = [untrained(own.stand_on_tensordict).to(dtype) for _ in range(2)]
+    one, other = (replan_forms._identity(planner, "eta") for planner in made)
+    assert one == other
+    with torch.no_grad():
+        next(made[1].eta.parameters()).add_(1.0)
+    assert replan_forms._identity(made[1], "eta") != one
+    assert replan_forms._identity(made[0], "static") != replan_forms._identity(made[1], "static")
+
+
+def test_a_planner_of_another_type_of_numbers_is_measured_in_its_own():
+    made = untrained(TASK.static_planner()).double()
+    rows = bench(made, batches=(2,), **QUICK)
+    assert "step between plans, planner" in whats(rows)
+    assert not any("error" in row for row in rows)
+    seen = moments(TASK, made)
+    assert seen.planning["target_history"].dtype == made(seen.planning.copy())["action"].dtype == torch.float64
+
+
 class Uneven(ReplanSchedule):
     """Plans at another step in each half of the table."""
 
@@ -170,7 +206,7 @@ def test_a_planner_that_never_plans_is_measured_in_its_steps_and_its_replan():
     assert "step that plans, lazy" not in named
 
 
-@pytest.mark.parametrize("plan", [TASK.planner("pursuit"), TASK.static_planner("ik"), own.chase])
+@pytest.mark.parametrize("plan", [TASK.planner("pursuit"), TASK.static_planner("ik"), own.stand_on_tensordict])
 def test_a_planner_that_plans_nothing_is_measured_in_its_step_alone(plan):
     rows = bench({"it": plan}, batches=(3,), **QUICK)
     assert names_of(rows) == [("step, it", "torchdyn_plan")]

@@ -7,7 +7,7 @@ from typing import Any, NamedTuple
 
 import torch
 from tensordict import TensorDict, TensorDictBase
-from torch import Tensor
+from torch import Tensor, nn
 
 from torchdyn_plan import keys, planners
 from torchdyn_plan.errors import InputError
@@ -116,9 +116,10 @@ class _Rows:
 def _play(env: Any, planner: Planner, future: Tensor | None) -> Iterator[tuple[TensorDict, TensorDictBase]]:
     """Step by step of at most an episode what ``planner`` sees, and the same after it acted.
 
-    A planner for a static goal is sent to where the target is; the others set a goal of their own.
+    A planner for a static goal is sent to where the target is; the others set a goal of their own. One of another type
+    of numbers sees them in its own.
     """
-    tensordict = env.reset()
+    tensordict, (dtype, own) = env.reset(), (torch.get_default_dtype(), _dtype(planner))
     if isinstance(planner, Remembering):
         memory = planner.empty_memory(tensordict[keys.TOOL_POS])
         tensordict[keys.PLAN] = TensorDict(memory, tensordict.batch_size)
@@ -126,10 +127,25 @@ def _play(env: Any, planner: Planner, future: Tensor | None) -> Iterator[tuple[T
         tensordict[keys.GOAL] = tensordict[keys.TARGET_POS].clone()
         if future is not None:
             tensordict[keys.TARGET_FUTURE] = future[tensordict[keys.EPISODE].clamp(max=len(future) - 1)]
+        tensordict = _in_type(tensordict, own)
         seen = tensordict.copy()
         acted = planner(tensordict)
         yield seen, acted
-        tensordict = env.step_and_maybe_reset(acted)[1]
+        tensordict = env.step_and_maybe_reset(_in_type(acted, own and dtype))[1]
+
+
+def _dtype(planner: Planner) -> torch.dtype | None:
+    """The type of numbers of ``planner``; None if it has none or several."""
+    tensors = [*planner.parameters(), *planner.buffers()] if isinstance(planner, nn.Module) else []
+    found = {tensor.dtype for tensor in tensors if tensor.is_floating_point()}
+    return found.pop() if len(found) == 1 else None
+
+
+def _in_type(tensordict: Any, dtype: torch.dtype | None) -> Any:
+    """The same with its numbers in ``dtype``, or as they are for None; what counts stays whole."""
+    if dtype is None:
+        return tensordict
+    return tensordict.apply(lambda value: value.to(dtype) if value.is_floating_point() else value)
 
 
 def _future(task: Task, planner: Planner) -> Tensor | None:

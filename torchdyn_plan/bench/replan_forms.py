@@ -43,7 +43,7 @@ def make_forms(
     """Everything that is timed on ``device``."""
     dynamic = {name: planner for name, planner in planners.items() if isinstance(planner, DynamicPlanner)}
     plain = _planning(dynamic, dynamic)
-    light = _planning(dynamic, {name: planner.for_inference() for name, planner in dynamic.items()})
+    light = _planning_for_inference(dynamic)
     alone: dict[str, Parts] = {}
     for name, planner in planners.items():
         alone[name] = searches(name, planner) if isinstance(planner, DynamicPlanner) else {}
@@ -79,6 +79,24 @@ def _planning(planners: Mapping[str, DynamicPlanner], forms: Mapping[str, Dynami
     return found
 
 
+def _planning_for_inference(planners: Mapping[str, DynamicPlanner]) -> dict[str, Parts]:
+    """What makes plans in copies of ``planners`` for inference; parts of one that has no copy raise why."""
+    copies, failed = dict(planners), {}
+    for name, planner in planners.items():
+        try:
+            copies[name] = planner.for_inference()
+        except Exception as error:
+            failed[name] = error
+    found = _planning(planners, copies)
+    for name, error in failed.items():
+        found[name] = {what: part._replace(inputs=partial(_fail, error)) for what, part in found[name].items()}
+    return found
+
+
+def _fail(error: Exception, seen: Moments) -> tuple[Any, ...]:
+    raise error
+
+
 def _labelled(parts: Parts, label: str) -> Parts:
     """The same with ``label`` behind their names."""
     return {f"{what}{label}": part for what, part in parts.items()}
@@ -103,5 +121,5 @@ def _weights_digest(network: Any) -> str:
     """Hash of the weights of a network."""
     digest = hashlib.sha256()
     for value in network.state_dict().values():
-        digest.update(value.cpu().contiguous().numpy().tobytes())
+        digest.update(value.detach().cpu().flatten().view(torch.uint8).numpy().tobytes())
     return digest.hexdigest()

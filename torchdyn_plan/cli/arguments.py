@@ -146,7 +146,7 @@ class BenchArguments(Arguments):
     benchmark: ClassVar[str]
 
     out: Path | None = None
-    """JSON file for the figures, written with each of them: a run that is killed leaves those that it has."""
+    """JSON file for the figures, written with each: a run that is killed leaves those it has; another begins anew."""
 
 
 @dataclass(frozen=True, kw_only=True)
