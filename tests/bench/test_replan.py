@@ -10,7 +10,7 @@ from torchdyn_plan import keys
 from torchdyn_plan.bench import replan_forms
 from torchdyn_plan.bench.observations import moments, observe, pursued
 from torchdyn_plan.bench.replan import bench, max_error
-from torchdyn_plan.bench.replan_parts import flat_replan, in_blocks, steps
+from torchdyn_plan.bench.replan_parts import flat_replan, in_blocks, replans, searches, steps
 from torchdyn_plan.errors import InputError
 from torchdyn_plan.nets import ETANetwork, Forecaster
 from torchdyn_plan.planners import (
@@ -99,15 +99,20 @@ def test_a_search_that_is_a_module_and_asks_for_the_distribution_of_arrivals_is_
     assert not any("error" in row for row in rows)
 
 
-def test_the_replan_that_is_measured_is_the_planner_s_own(planner, monkeypatch):
+def test_the_replan_and_the_search_that_are_measured_are_the_planner_s_own(planner):
     class Own(DynamicPlanner):
         def replan(self, observation, plan):
-            sizes.append(len(observation.step_count))
-            return super().replan(observation, plan)
+            plan = super().replan(observation, plan)
+            return plan._replace(goal=plan.goal + 1.0)
 
-    sizes = []
-    bench(Own(**planner.part_settings()).eval(), batches=(7,), **QUICK)
-    assert {1, 7} < set(sizes)
+    made = Own(**planner.with_parts(search=own.meet_in_hundred).part_settings()).eval()
+    seen = moments(TASK, made)
+    ahead = made.forecaster(seen.planning["target_history"])[:, 99]
+    for parts, shift in ((replans("own", made), 1.0), (searches("own", made), 0.0)):
+        ((_, part),) = parts.items()
+        goal, arrival_steps = part.call(*part.inputs(seen))
+        assert torch.allclose(goal, ahead + shift)
+        assert (arrival_steps == 100).all()
 
 
 @pytest.mark.parametrize(
