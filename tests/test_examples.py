@@ -16,6 +16,7 @@ EXAMPLES = Path(__file__).parent.parent / "examples"
         ("train_ddpg_her.py --rounds 2 --num-envs 2 --updates 2", "round    2: mean reward"),
         ("06_any_planner.py", "wait_and_drop, mj_jac"),
         ("05_real_time_loop.py", "plans came into use"),
+        ("bench_own_planner.py", "re-plan, mine, for inference"),
         ("07_fine_tune_forecaster.py", "after: miss 0.0"),
     ],
 )

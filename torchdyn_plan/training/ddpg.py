@@ -15,12 +15,12 @@ from torchrl.modules import AdditiveGaussianModule, ValueOperator
 from torchrl.objectives import SoftUpdate
 
 from torchdyn_plan import keys
+from torchdyn_plan.checks import check_device
 from torchdyn_plan.errors import TrainingError
 from torchdyn_plan.nets.policy import Actor, Critic
 from torchdyn_plan.training.checkpoint import group
 from torchdyn_plan.training.exploration import BoundedTD0, PenalisedDDPGLoss, RandomActionModule
 from torchdyn_plan.training.goal_task import SEEN, DDPGRecipe, GoalReplay, GoalTask
-from torchdyn_plan.training.optimise import check_device
 
 
 class DDPG:
