@@ -86,6 +86,8 @@ class GymEnv(_Gym, gymnasium.Env[Shown, Array], EzPickle):
     series of its own.
     """
 
+    metadata: dict[str, Any] = {"render_modes": list(RENDER_MODES)}  # noqa: RUF012  # As Gymnasium declares it.
+
     def __init__(self, form: str | GymForm, *, render_mode: str | None = None, **settings: Any) -> None:
         """Build a world of one environment.
 
@@ -96,7 +98,7 @@ class GymEnv(_Gym, gymnasium.Env[Shown, Array], EzPickle):
         """
         EzPickle.__init__(self, form, render_mode=render_mode, **settings)
         self._build(form, 1, render_mode, settings)
-        self.metadata = {"render_modes": list(RENDER_MODES), "render_fps": self.form.fps}
+        self.metadata = self.metadata | {"render_fps": self.form.fps}
         self.observation_space, self.action_space = self._spaces()
 
     def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Shown, dict[str, Any]]:
@@ -151,17 +153,18 @@ class GymVectorEnv(_Gym, VectorEnv[Shown, Array, Array]):
     ``final_obs`` and ``final_info`` of ``infos`` hold what the old one ended with.
     """
 
+    metadata: dict[str, Any] = {  # noqa: RUF012  # As Gymnasium declares it.
+        "render_modes": list(RENDER_MODES),
+        "autoreset_mode": AutoresetMode.SAME_STEP,
+    }
+
     def __init__(
         self, form: str | GymForm, num_envs: int = 1, *, render_mode: str | None = None, **settings: Any
     ) -> None:
         """Build a world of ``num_envs`` environments; arguments as of `GymEnv`."""
         self._build(form, num_envs, render_mode, settings)
         self.num_envs = num_envs
-        self.metadata = {
-            "render_modes": list(RENDER_MODES),
-            "render_fps": self.form.fps,
-            "autoreset_mode": AutoresetMode.SAME_STEP,
-        }
+        self.metadata = self.metadata | {"render_fps": self.form.fps}
         self.single_observation_space, self.single_action_space = self._spaces()
         self.observation_space = batch_space(self.single_observation_space, num_envs)
         self.action_space = batch_space(self.single_action_space, num_envs)
