@@ -78,7 +78,7 @@ class RecordedFuture(ForecastModel):
         check_trailing_shape(keys.TARGET_FUTURE, target_future, target_future.shape[-2], 3)
         check_finite(keys.TARGET_FUTURE, target_future)
         ahead = torch.arange(1, self.horizon + 1, device=target_future.device)
-        index = (step_count.reshape(-1, 1) + ahead).clamp(max=target_future.shape[-2] - 1)
+        index = (step_count.reshape(-1, 1).long() + ahead).clamp(max=target_future.shape[-2] - 1)
         return Forecast(target_future.gather(-2, index.unsqueeze(-1).expand(-1, -1, 3)))
 
     def part_settings(self) -> dict[str, Any]:

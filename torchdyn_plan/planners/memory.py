@@ -11,6 +11,7 @@ import torch
 from tensordict import TensorDict, TensorDictBase
 from tensordict.nn import TensorDictModuleBase
 from torch import Tensor
+from torch.func import debug_unwrap
 
 from torchdyn_plan import keys
 from torchdyn_plan.errors import InputError
@@ -78,7 +79,7 @@ class PlannerMemory:
         # A plain dictionary: a look-up in a tensordict takes as long as a small operation.
         stored = {} if plan is None else dict(plan.items())
         fresh = observation.step_count == 0
-        some_fresh = torch.compiler.is_compiling() or bool(fresh.any())
+        some_fresh = torch.compiler.is_compiling() or bool(debug_unwrap(fresh).any())
         lost = [name for name in self.names if name not in stored]
         if lost:
             warn_of_loss(lost[0], fresh)
@@ -111,7 +112,7 @@ class PlannerMemory:
 
 def warn_of_loss(name: str, fresh: Tensor) -> None:
     """Warn if rows that are not ``fresh`` (*B,) have lost the entry ``name`` of their memory."""
-    if torch.compiler.is_compiling() or bool(fresh.all()):
+    if torch.compiler.is_compiling() or bool(debug_unwrap(fresh).all()):
         return
     warnings.warn(
         f"a planner remembers nothing ('plan', {name!r} is absent) in rows that are past step 0, and starts afresh "

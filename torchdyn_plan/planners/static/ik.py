@@ -9,6 +9,7 @@ from typing import Any, NamedTuple, cast
 import torch
 from tensordict import TensorDictBase
 from torch import Tensor, nn
+from torch.func import debug_unwrap
 
 from torchdyn_plan import keys
 from torchdyn_plan.checks import check_finite, check_number, check_trailing_shape
@@ -100,7 +101,7 @@ class IKPlanner(StaticPlannerModule):
         joint_pos, goal, step_count = values
         if not torch.compiler.is_compiling():
             fits = joint_pos.shape[-1:] == self._limit.shape and goal.shape == (*joint_pos.shape[:-1], 3)
-            if not (fits and math.isfinite(goal.sum().item())):
+            if not (fits and math.isfinite(debug_unwrap(goal).sum().item())):
                 self._check(joint_pos, goal)
         path_pos, path_step = self._recall(tensordict.get(keys.PLAN, None), joint_pos, goal, step_count)
         blocks = self.chunk is not None and self._fused is None
