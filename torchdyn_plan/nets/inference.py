@@ -180,10 +180,10 @@ class InferenceForecaster(Precise, DescribedForecast):
             return ()
         place, speed = now[:, :2], newest[:, :2]
         if self.config.square_symmetry:
-            wait = (extent - place).div_(speed.clamp_min(1e-6)).clamp_(0.0, most)
+            wait = (extent - place).div_(speed.clamp_min(1e-6)).clamp(0.0, most)
         else:
             direction = torch.where(speed < 0, -1.0, 1.0)
-            wait = (extent - place * direction).div_((speed * direction).clamp_min(1e-6)).clamp_(0.0, most)
+            wait = (extent - place * direction).div_((speed * direction).clamp_min(1e-6)).clamp(0.0, most)
         period = torch.addcmul(place, speed, wait.flip(-1)).sub_(extent).mul_(0.25 / extent)
         return wait, wait.log1p(), period.sub_(period.round()).abs_()
 

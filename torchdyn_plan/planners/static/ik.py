@@ -22,6 +22,7 @@ from torchdyn_plan.planners.memory import remember, warn_of_loss
 from torchdyn_plan.planners.protocol import read
 from torchdyn_plan.planners.static.approach import Approach, StraightToGoal
 from torchdyn_plan.planners.static.base import StaticPlannerModule
+from torchdyn_plan.precision import Precise
 
 
 class Path(NamedTuple):
@@ -38,7 +39,7 @@ class Path(NamedTuple):
 PATH_NAMES = tuple(f"path_{field}" for field in Path._fields)
 
 
-class IKPlanner(StaticPlannerModule):
+class IKPlanner(Precise, StaticPlannerModule):
     """Drives an arm's tool to ``goal`` by inverse kinematics, in the way that its approach says.
 
     Reads ``joint_pos`` (*B, N) [rad], ``goal`` (*B, 3) [m, world] and ``step_count`` (*B,); writes ``action`` (*B, N)
