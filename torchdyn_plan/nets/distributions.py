@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 
 from torchdyn_plan.checks import check_number
-from torchdyn_plan.precision import at_least_float32, autocast_is_on, without_autocast
+from torchdyn_plan.precision import EXACT, at_least_float32, autocast_is_on, without_autocast
 
 
 class Arrival(NamedTuple):
@@ -96,7 +96,7 @@ def decode_mode(logits: Tensor, *, bin_width: int = 5) -> Arrival:
     Returns:
         `Arrival` of ``(*B,)``; ``never`` where the last class is the likeliest, with the likeliest bin all the same.
     """
-    bins, logits = logits.shape[-1] - 1, at_least_float32(logits)
+    bins, logits = logits.shape[-1] - 1, logits if logits.dtype in EXACT else logits.float()
     never = logits.argmax(dim=-1) == bins
     steps = bin_width * logits[..., :bins].argmax(dim=-1) + (bin_width - 1) // 2
     return Arrival(steps.to(logits.dtype), never)
@@ -115,7 +115,7 @@ def decode_distribution(logits: Tensor, *, bin_width: int = 5, moments: Tensor |
     """
     if autocast_is_on():
         return without_autocast(decode_distribution, logits, bin_width=bin_width, moments=moments)
-    logits = at_least_float32(logits)
+    logits = logits if logits.dtype in EXACT else logits.float()
     if moments is None:
         moments = arrival_moments(logits, bin_width)
     probability = logits.softmax(dim=-1)
