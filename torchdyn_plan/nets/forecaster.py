@@ -14,7 +14,7 @@ from torchdyn_plan.nets.forecast import DescribedForecast
 from torchdyn_plan.nets.pretrained import Pretrained
 from torchdyn_plan.nets.reflection import reflect
 from torchdyn_plan.nets.symmetry import octant, square_symmetries
-from torchdyn_plan.precision import Precise, autocast_is_on, without_autocast
+from torchdyn_plan.precision import Precise, autocast_is_on, in_type_of, without_autocast
 
 if TYPE_CHECKING:
     from torchdyn_plan.nets.inference import InferenceForecaster
@@ -129,12 +129,13 @@ class Forecaster(Pretrained, Precise, DescribedForecast):
         """The same forecast, and what a `torchdyn_plan.nets.SpreadNetwork` judges it by.
 
         Returns:
-            Positions (*B, F, 3) [m, world] and the last hidden layer (*B, hidden), of the history's type, and whether
-            x and y are exchanged in it (*B,): mirrored and turned histories share their features.
+            Positions (*B, F, 3) [m, world] and the last hidden layer (*B, hidden), of the history's type (the latter in
+            float32 at least), and whether x and y are exchanged in it (*B,): mirrored and turned histories share their
+            features.
         """
         forecast, features, swapped = self._forecast(target_history, reflected=self.config.half_extent is not None)
         batch = target_history.shape[:-2]
-        return forecast, features.to(forecast.dtype).view(*batch, self.config.hidden), swapped.view(batch)
+        return forecast, in_type_of(forecast, features).view(*batch, self.config.hidden), swapped.view(batch)
 
     def unreflected(self, target_history: Tensor) -> Tensor:
         """Same as `forward` before cushions reflect the line: what training compares, ``(*B, F, 3)`` [m, world]."""

@@ -98,7 +98,7 @@ class InferenceForecaster(Precise, DescribedForecast):
         """The same forecast, and what a spread is told by, as `Forecaster.describe` describes."""
         forecast, hidden, turn = self._forecast(target_history)
         batch = target_history.shape[:-2]
-        hidden = hidden.to(forecast.dtype).view(*batch, self.config.hidden)
+        hidden = in_type_of(forecast, hidden).view(*batch, self.config.hidden)
         return forecast, hidden, (turn[:, 0, 0] == 0.0).view(batch)
 
     def _forecast(self, target_history: Tensor) -> tuple[Tensor, Tensor, Tensor]:
@@ -153,7 +153,7 @@ class InferenceForecaster(Precise, DescribedForecast):
     def _line(self, step: Tensor, now: Tensor, newest: Tensor) -> tuple[Tensor, Tensor]:
         """Unreflected line (R, 3, F) and hidden features; with cushions x and y count in periods of the reflection."""
         real = step.any(dim=-1, keepdim=True).to(step.dtype)
-        change = torch.addcmul(self.zero, step - step[:, -1:], real, value=1.0 / self.config.change_scale).asinh_()
+        change = torch.addcmul(self.zero, step - step[:, -1:], real, value=1.0 / self.config.change_scale).asinh()
         features = torch.cat([step, change, real], dim=-1).view(-1, 7)
         features = torch.addmm(self.embed_bias, features, self.embed_weight).relu_()
         for number, dense in enumerate(self.dense):
