@@ -139,14 +139,15 @@ class Remembering(TensorDictModuleBase):
         """Entries below ``plan`` of rows at step 0, in the batch, type and device of ``like`` (*B, 3); none here."""
         return {}
 
-    def make_tensordict_primer(self) -> Any:
+    def make_tensordict_primer(self, dtype: torch.dtype = torch.float32) -> Any:
         """A TorchRL transform that lets environments carry the memory, `torchrl.envs.TensorDictPrimer`.
 
         Environments that run in other processes, and collectors over them, carry nothing that no spec declares.
+        ``dtype`` is that of the environment's positions.
         """
         from torchrl.data import Composite, Unbounded
         from torchrl.envs.transforms import TensorDictPrimer
 
-        entries = self.empty_memory(torch.zeros(3))
+        entries = self.empty_memory(torch.zeros(3, dtype=dtype))
         specs = {name: Unbounded(shape=value.shape, dtype=value.dtype) for name, value in entries.items()}
         return TensorDictPrimer(Composite({keys.PLAN: Composite(specs)}), default_value=0.0, expand_specs=True)

@@ -154,6 +154,11 @@ def input_status(observation: Observation, lost: Lost | None) -> Tensor:
 
 
 def usable_path(path: Tensor, target_pos: Tensor) -> tuple[Tensor, Tensor]:
-    """The path ``(*B, F, 3)``, a target at rest at ``target_pos`` (*B, 3) where it is of no use, and its use (*B,)."""
+    """The path ``(*B, F, 3)``, a target at rest at ``target_pos`` (*B, 3) where it is of no use, and its use (*B,).
+
+    Whatever forecasts it, the path has the type of the target's position.
+    """
+    if path.dtype != target_pos.dtype:
+        path = path.to(target_pos.dtype)
     usable = path.abs().amax((-2, -1), keepdim=True) <= FARTHEST
     return torch.where(usable, path, target_pos.unsqueeze(-2)), usable.view(target_pos.shape[:-1])
