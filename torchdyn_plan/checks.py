@@ -1,4 +1,8 @@
-"""Checks at the public entries: one clear error that names the offender and what was expected."""
+"""Checks at the public entries: one clear error that names the offender and what was expected.
+
+Values are looked at here, and nowhere while a model is compiled. Under ``torch.vmap`` they are looked at through
+``torch.func.debug_unwrap``, which shows those of all rows together and otherwise the tensor itself.
+"""
 
 import difflib
 import math
@@ -7,6 +11,7 @@ from pathlib import Path
 
 import torch
 from torch import Tensor
+from torch.func import debug_unwrap
 
 from torchdyn_plan.errors import InputError, OutputError
 
@@ -21,7 +26,10 @@ def check_trailing_shape(name: str, tensor: Tensor, *trailing: int) -> None:
 
 
 def check_finite(name: str, tensor: Tensor) -> None:
-    """Raise `InputError` if ``tensor`` holds a NaN or an infinity."""
+    """Raise `InputError` if ``tensor`` holds a NaN or an infinity; nothing is looked at while compiling."""
+    if torch.compiler.is_compiling():
+        return
+    tensor = debug_unwrap(tensor)
     # The sum is a quick look: only a sum that is not finite is worth the full one.
     if not math.isfinite(tensor.sum().item()) and not bool(torch.isfinite(tensor).all()):
         bad = int((~torch.isfinite(tensor)).sum())
@@ -34,25 +42,41 @@ def check_same_device(name: str, tensor: Tensor, device: torch.device, owner: st
         raise InputError(f"{name} is on {tensor.device}, but {owner} is on {device}: move one of them")
 
 
-def check_input(
-    name: str, tensor: Tensor, *trailing: int, device: torch.device, owner: str, finite: bool = True
-) -> None:
-    """All three checks of a network's input, unless it is compiled.
+def check_floating(name: str, tensor: Tensor) -> None:
+    """Raise `InputError` unless ``tensor`` holds floating-point numbers."""
+    if not tensor.is_floating_point():
+        raise InputError(f"{name} must hold floating-point numbers, got {tensor.dtype}")
+
+
+def network_input(
+    name: str, tensor: Tensor, *trailing: int, like: Tensor, owner: str = "the network", finite: bool = True
+) -> Tensor:
+    """``tensor`` in the precision of ``like``, after all checks of a network's input, unless it is compiled.
 
     Args:
         name: of the argument.
-        tensor: must have shape ``(*B, *trailing)``.
+        tensor: must have shape ``(*B, *trailing)`` and hold floating-point numbers.
         trailing: sizes of the last dimensions.
-        device: of the network.
+        like: a constant of the network, in whose precision and on whose device it computes.
         owner: the network's name.
         finite: it must hold no NaN or infinity, either.
     """
-    if torch.compiler.is_compiling():
-        return
-    check_trailing_shape(name, tensor, *trailing)
-    check_same_device(name, tensor, device, owner)
-    if finite:
-        check_finite(name, tensor)
+    if not torch.compiler.is_compiling():
+        # One quick look passes nearly always; the checks one by one say what is wrong.
+        good = isinstance(tensor, Tensor) and tensor.shape[-len(trailing) :] == trailing
+        good = good and tensor.device == like.device and tensor.is_floating_point()
+        if not good or (finite and not math.isfinite(debug_unwrap(tensor).sum().item())):
+            check_trailing_shape(name, tensor, *trailing)
+            check_same_device(name, tensor, like.device, owner)
+            check_floating(name, tensor)
+            if finite:
+                check_finite(name, tensor)
+    return tensor if tensor.dtype == like.dtype else tensor.to(like.dtype)
+
+
+def hides_values(tensor: Tensor) -> bool:
+    """Whether results may not depend on looking at ``tensor``: it is compiled, or stands for many under ``vmap``."""
+    return torch.compiler.is_compiling() or debug_unwrap(tensor) is not tensor
 
 
 def check_choice(name: str, value: str, choices: Iterable[str]) -> None:

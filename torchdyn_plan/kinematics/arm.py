@@ -6,7 +6,7 @@ from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any, cast
 
 import torch
-from torch import Tensor, nn
+from torch import Tensor
 
 from torchdyn_plan.checks import check_choice, check_same_device, check_trailing_shape
 from torchdyn_plan.errors import InputError
@@ -15,14 +15,16 @@ from torchdyn_plan.kinematics.descriptions import joints_of_chain, joints_of_mjc
 from torchdyn_plan.kinematics.forms import FORMS, SineForm, TransformForm
 from torchdyn_plan.kinematics.joint import Joint, merge_fixed
 from torchdyn_plan.kinematics.ur5 import UR5_SPEED_LIMIT, ur5_urdf
+from torchdyn_plan.precision import Precise
 
 if TYPE_CHECKING:
     import pytorch_kinematics
 
 
-class Arm(nn.Module):
+class Arm(Precise):
     """A serial chain of N revolute and prismatic joints, parsed by pytorch-kinematics and evaluated in closed form.
 
+    It computes in float32 or float64; ``half()`` leaves it in float32.
     The buffers ``lower``, ``upper`` (N,) [rad; m] and ``speed_limit`` (N,) [rad/s; m/s] hold the joints' limits.
 
     ``form`` says how the arm is evaluated; all forms are exact, and the attribute of that name does the work:

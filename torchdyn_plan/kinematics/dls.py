@@ -5,6 +5,8 @@ import math
 import torch
 from torch import Tensor
 
+from torchdyn_plan.precision import autocast_is_on, without_autocast
+
 QUARTER_TURN = math.pi / 2
 
 
@@ -20,6 +22,8 @@ def dls_step(jacobian: Tensor, error: Tensor, damping: float | Tensor, *, prefer
     Returns:
         ``(*B, N)`` [rad].
     """
+    if autocast_is_on():
+        return without_autocast(dls_step, jacobian, error, damping, preferred=preferred)
     if preferred is not None:
         error = error - (jacobian @ preferred.unsqueeze(-1)).squeeze(-1)
     gram = jacobian @ jacobian.mT

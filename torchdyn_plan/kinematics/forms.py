@@ -13,12 +13,13 @@ from torch import Tensor, nn
 from torchdyn_plan.errors import InputError
 from torchdyn_plan.kinematics.joint import Joint
 from torchdyn_plan.kinematics.trigonometric import NEGLIGIBLE, TrigonometricForm, trigonometric_form
+from torchdyn_plan.precision import Precise, autocast_is_on, without_autocast
 
 MOST_SINES = 128
 """More sines than this in one product cost more than a product of transforms."""
 
 
-class SineForm(nn.Module):
+class SineForm(Precise):
     """Pose and Jacobian as ``sin(q·C + b) · W``, three tensor operations; the constant is a sine of frequency 0."""
 
     _frequencies: Tensor
@@ -45,6 +46,8 @@ class SineForm(nn.Module):
 
     def forward(self, joint_pos: Tensor) -> Tensor:
         """Pose ``(B, 4, 4)`` alone, for ``(B, N)``."""
+        if autocast_is_on():
+            return without_autocast(self.forward, joint_pos)
         # A module's attribute that is a buffer takes as long to look up as a small operation; its table does not.
         own = cast(dict[str, Tensor], self._buffers)
         sines = torch.addmm(own["_phases"], joint_pos, own["_frequencies"]).sin()
@@ -55,6 +58,8 @@ class SineForm(nn.Module):
 
     def pose_and_jacobian(self, joint_pos: Tensor) -> tuple[Tensor, Tensor]:
         """Pose ``(B, 4, 4)`` and Jacobian ``(B, 6, N)``, for ``(B, N)``."""
+        if autocast_is_on():
+            return without_autocast(self.pose_and_jacobian, joint_pos)
         own = cast(dict[str, Tensor], self._buffers)
         sines = torch.addmm(own["_phases"], joint_pos, own["_frequencies"]).sin()
         pose, jacobian = torch.mm(sines, own["_pose_weights"]), torch.mm(sines, own["_jacobian_weights"])
@@ -64,7 +69,7 @@ class SineForm(nn.Module):
         return pose.view(-1, 4, 4), jacobian.view(-1, 6, self.num_joints)
 
 
-class TransformForm(nn.Module):
+class TransformForm(Precise):
     """Pose and Jacobian as a product of transforms, each of a few neighbouring joints and itself a product of sines."""
 
     _frequencies: Tensor
@@ -88,6 +93,8 @@ class TransformForm(nn.Module):
 
     def forward(self, joint_pos: Tensor) -> Tensor:
         """Pose ``(B, 4, 4)`` alone, for ``(B, N)``."""
+        if autocast_is_on():
+            return without_autocast(self.forward, joint_pos)
         first, *others = self._transforms(joint_pos)
         rotation, place = first[..., :3], first[..., 3:4]
         for other in others:
@@ -100,6 +107,8 @@ class TransformForm(nn.Module):
 
         A transform behind another is turned by it, and lengthens its joints' levers: v = v₁ + ω₁ × (R₁p₂).
         """
+        if autocast_is_on():
+            return without_autocast(self.pose_and_jacobian, joint_pos)
         first, *others = self._transforms(joint_pos)
         counts = iter(self.counts)
         rotation, place, speed, turn = first.split((3, 1, count := next(counts), count), dim=-1)

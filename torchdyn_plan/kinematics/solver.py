@@ -16,6 +16,7 @@ from torchdyn_plan.kinematics.arm import Arm
 from torchdyn_plan.kinematics.dls import dls_step
 from torchdyn_plan.kinematics.implicit import refine
 from torchdyn_plan.kinematics.targets import CONSTRAINTS, constraint_error, constraint_jacobian
+from torchdyn_plan.precision import without_autocast
 
 BLOCK = 64
 """Rows of one product of matrices: a fixed number, so that a row's answer does not depend on its company."""
@@ -111,7 +112,7 @@ def solve_ik(
         search = _Search(arm, constraint, symmetry, tolerances, iterations, limit, posture)
         starts = _starts(arm, sum(rounds))
         first = starts[:1].expand(len(wanted), count) if q0 is None else _rows("q0", q0, arm, batch)
-        q, status, residual = _solve_rows(search, wanted, first, starts, rounds)
+        q, status, residual = without_autocast(_solve_rows, search, wanted, first, starts, rounds)
     result = IKResult(q.view(*batch, count), status.view(batch), residual.view(*batch, 2))
     if not differentiable:
         return result

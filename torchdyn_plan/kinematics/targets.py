@@ -7,6 +7,8 @@ import math
 import torch
 from torch import Tensor
 
+from torchdyn_plan.precision import autocast_is_on, without_autocast
+
 CONSTRAINTS = {"pose": 6, "axis": 5, "position": 3}
 """Directions that each constrains: the whole pose, place and direction of the tool's z axis, place."""
 
@@ -24,6 +26,8 @@ def constraint_error(pose: Tensor, target: Tensor, *, constraint: str = "pose", 
         ``(*B, R)`` [m; rad]. For a pose the turn is a rotation vector in the base frame; for an axis, the turn about
         the target's x and y axes that brings the tool's z axis there.
     """
+    if autocast_is_on():
+        return without_autocast(constraint_error, pose, target, constraint=constraint, symmetry=symmetry)
     way = target[..., :3, 3] - pose[..., :3, 3]
     if constraint == "position":
         return way
@@ -41,6 +45,8 @@ def constraint_jacobian(jacobian: Tensor, target: Tensor, *, constraint: str = "
         return jacobian
     if constraint == "position":
         return jacobian[..., :3, :]
+    if autocast_is_on():
+        return without_autocast(constraint_jacobian, jacobian, target, constraint=constraint)
     return torch.cat([jacobian[..., :3, :], target[..., :3, :2].mT @ jacobian[..., 3:, :]], dim=-2)
 
 

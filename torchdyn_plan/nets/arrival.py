@@ -12,6 +12,7 @@ from torch import Tensor, nn
 
 from torchdyn_plan.errors import InputError
 from torchdyn_plan.nets.distributions import Arrival
+from torchdyn_plan.precision import in_type_of
 
 
 class ArrivalQuery(Protocol):
@@ -59,6 +60,6 @@ class FunctionArrival(ArrivalModel):
         return cls(model)
 
     def arrival(self, robot_state: Tensor, goal: Tensor, *, estimator: str = "mode") -> Arrival:
-        """What the function returns; steps that are infinite are *never*."""
+        """What the function returns, steps in the goals' type; those that are infinite are *never*."""
         found = self.function(robot_state, goal)
-        return found if isinstance(found, Arrival) else Arrival(found, torch.isinf(found))
+        return found if isinstance(found, Arrival) else Arrival(in_type_of(goal, found), torch.isinf(found))

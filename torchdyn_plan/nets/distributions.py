@@ -9,13 +9,15 @@ import torch
 from torch import Tensor
 
 from torchdyn_plan.checks import check_number
+from torchdyn_plan.precision import EXACT, at_least_float32, autocast_is_on, without_autocast
 
 
 class Arrival(NamedTuple):
     """When, and whether, the robot arrives at each of some goals."""
 
     steps: Tensor
-    """``(*B,)`` control steps from now, in the model's dtype; where ``never`` is True, if it arrived after all."""
+    """``(*B,)`` control steps from now, of the goals' type, in float32 at least; where ``never`` is True, if it arrived
+    after all."""
     never: Tensor
     """``(*B,)`` bool: the goal is never reached; by the estimator ``soft``, the probability of that."""
     bins: Tensor | None = None
@@ -94,7 +96,7 @@ def decode_mode(logits: Tensor, *, bin_width: int = 5) -> Arrival:
     Returns:
         `Arrival` of ``(*B,)``; ``never`` where the last class is the likeliest, with the likeliest bin all the same.
     """
-    bins = logits.shape[-1] - 1
+    bins, logits = logits.shape[-1] - 1, logits if logits.dtype in EXACT else logits.float()
     never = logits.argmax(dim=-1) == bins
     steps = bin_width * logits[..., :bins].argmax(dim=-1) + (bin_width - 1) // 2
     return Arrival(steps.to(logits.dtype), never)
@@ -111,6 +113,9 @@ def decode_distribution(logits: Tensor, *, bin_width: int = 5, moments: Tensor |
     Returns:
         `Arrival` of ``(*B,)``; ``never`` where *never* is likelier than all bins together.
     """
+    if autocast_is_on():
+        return without_autocast(decode_distribution, logits, bin_width=bin_width, moments=moments)
+    logits = logits if logits.dtype in EXACT else logits.float()
     if moments is None:
         moments = arrival_moments(logits, bin_width)
     probability = logits.softmax(dim=-1)
@@ -136,7 +141,7 @@ def arrival_moments(logits: Tensor, bin_width: int) -> Tensor:
 def decode_soft(logits: Tensor, *, bin_width: int = 5) -> Arrival:
     """As `decode_expectation`, but ``never`` is a probability: all of it is differentiable."""
     arrival = decode_expectation(logits, bin_width=bin_width)
-    return Arrival(arrival.steps, logits.softmax(dim=-1)[..., -1])
+    return Arrival(arrival.steps, at_least_float32(logits).softmax(dim=-1)[..., -1])
 
 
 ESTIMATORS: dict[str, Callable[..., Arrival]] = {

@@ -8,11 +8,12 @@ from typing import TYPE_CHECKING, Any
 import torch
 from torch import Tensor, nn
 
-from torchdyn_plan.checks import check_choice, check_input, check_number
+from torchdyn_plan.checks import check_choice, check_number, network_input
 from torchdyn_plan.errors import InputError
 from torchdyn_plan.nets.arrival import ArrivalModel
 from torchdyn_plan.nets.distributions import ESTIMATORS, Arrival
 from torchdyn_plan.nets.pretrained import Pretrained
+from torchdyn_plan.precision import EXACT, Precise, autocast_is_on, without_autocast
 
 if TYPE_CHECKING:
     from torchdyn_plan.nets.inference import InferenceETA
@@ -44,7 +45,7 @@ class ETAConfig:
             )
 
 
-class ETANetwork(Pretrained, ArrivalModel):
+class ETANetwork(Pretrained, Precise, ArrivalModel):
     """Estimated time of arrival P_ETA^R (paper, Section III-B.3): robot state and goal to a distribution over time.
 
     Three hidden linear + ReLU layers and a linear one. Features of the state enter the first layer separately from
@@ -91,19 +92,21 @@ class ETANetwork(Pretrained, ArrivalModel):
             goal: ``(*B, 3)`` places to reach [m, world].
 
         Returns:
-            ``(*B, bins + 1)`` logits.
+            ``(*B, bins + 1)`` logits, of the goals' type.
 
         Raises:
             InputError: a trailing shape or a device is wrong, or an input holds a NaN.
         """
-        about: Any = {"device": self.head.weight.device, "owner": type(self).__name__}
-        check_input("robot_state", robot_state, self.config.robot_state_size, **about)
-        check_input("goal", goal, 3, **about)
-        state = torch.addcmul(self.state_shift, robot_state, self.state_scale)
-        target = torch.addcmul(self.goal_shift, self._goal_features(robot_state, goal), self.goal_scale)
-        hidden = (self.state_in(state) + self.goal_in(target)).relu_()
+        if autocast_is_on():
+            return without_autocast(self.forward, robot_state, goal)
+        about: Any = {"like": self.state_scale, "owner": type(self).__name__}
+        seen = network_input("robot_state", robot_state, self.config.robot_state_size, **about)
+        place, stored = network_input("goal", goal, 3, **about), self.head.weight.dtype
+        state = torch.addcmul(self.state_shift, seen, self.state_scale)
+        target = torch.addcmul(self.goal_shift, self._goal_features(seen, place), self.goal_scale)
+        hidden = (self.state_in(state.to(stored)) + self.goal_in(target.to(stored))).relu_()
         rows = self.third(self.second(hidden.view(-1, self.config.hidden)).relu_()).relu_()
-        return self.head(rows).view(*hidden.shape[:-1], self.config.bins + 1)
+        return self.head(rows).view(*hidden.shape[:-1], self.config.bins + 1).to(goal.dtype)
 
     def arrival(self, robot_state: Tensor, goal: Tensor, *, estimator: str = "mode") -> Arrival:
         """Arrival time at ``goal (*B, 3)`` from ``robot_state (*B, S)``, batches broadcasting as in `forward`.
@@ -114,7 +117,10 @@ class ETANetwork(Pretrained, ArrivalModel):
             estimator: ``mode``, the paper's; ``expectation``, which is finer than a bin; ``distribution``, the same
                 with the probability of every bin; or ``soft``, for gradients.
         """
-        check_choice("estimator", estimator, ESTIMATORS)
+        if estimator not in ESTIMATORS:
+            check_choice("estimator", estimator, ESTIMATORS)
+        if goal.dtype not in EXACT:
+            goal = goal.float()
         return ESTIMATORS[estimator](self(robot_state, goal), bin_width=self.config.bin_width)
 
     def for_inference(self) -> InferenceETA:

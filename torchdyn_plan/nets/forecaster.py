@@ -8,12 +8,13 @@ from typing import TYPE_CHECKING, Any
 import torch
 from torch import Tensor, nn
 
-from torchdyn_plan.checks import check_input, check_number
+from torchdyn_plan.checks import check_number, network_input
 from torchdyn_plan.errors import InputError
 from torchdyn_plan.nets.forecast import DescribedForecast
 from torchdyn_plan.nets.pretrained import Pretrained
 from torchdyn_plan.nets.reflection import reflect
 from torchdyn_plan.nets.symmetry import octant, square_symmetries
+from torchdyn_plan.precision import Precise, autocast_is_on, in_type_of, without_autocast
 
 if TYPE_CHECKING:
     from torchdyn_plan.nets.inference import InferenceForecaster
@@ -60,7 +61,7 @@ class ForecasterConfig:
             raise InputError(f"square_symmetry must be a bool, got {self.square_symmetry!r}")
 
 
-class Forecaster(Pretrained, DescribedForecast):
+class Forecaster(Pretrained, Precise, DescribedForecast):
     """Trajectory forecasting network P_traj^O (paper, eq. 2), after the convolutional one of Nikhil & Morris (2018).
 
     Relative displacements are embedded step by step, convolved over the history, joined with the newest position and
@@ -117,7 +118,7 @@ class Forecaster(Pretrained, DescribedForecast):
             target_history: ``(*B, H, 3)`` positions, oldest first; rows before the first sample repeat it [m, world].
 
         Returns:
-            ``(*B, F, 3)``: entry e-1 is the position in e steps [m, world].
+            ``(*B, F, 3)``, of the history's type: entry e-1 is the position in e steps [m, world].
 
         Raises:
             InputError: the history has another shape, another device than the network, or holds a NaN.
@@ -128,12 +129,13 @@ class Forecaster(Pretrained, DescribedForecast):
         """The same forecast, and what a `torchdyn_plan.nets.SpreadNetwork` judges it by.
 
         Returns:
-            Positions (*B, F, 3) [m, world], the last hidden layer (*B, hidden), and whether x and y are exchanged
-            in it (*B,): mirrored and turned histories share their features.
+            Positions (*B, F, 3) [m, world] and the last hidden layer (*B, hidden), of the history's type (the latter in
+            float32 at least), and whether x and y are exchanged in it (*B,): mirrored and turned histories share their
+            features.
         """
         forecast, features, swapped = self._forecast(target_history, reflected=self.config.half_extent is not None)
         batch = target_history.shape[:-2]
-        return forecast, features.view(*batch, self.config.hidden), swapped.view(batch)
+        return forecast, in_type_of(forecast, features).view(*batch, self.config.hidden), swapped.view(batch)
 
     def unreflected(self, target_history: Tensor) -> Tensor:
         """Same as `forward` before cushions reflect the line: what training compares, ``(*B, F, 3)`` [m, world]."""
@@ -147,10 +149,11 @@ class Forecaster(Pretrained, DescribedForecast):
 
     def _forecast(self, target_history: Tensor, *, reflected: bool) -> tuple[Tensor, Tensor, Tensor]:
         """Positions (*B, F, 3), hidden features (R, hidden) and whether x and y are exchanged in them (R,)."""
-        config, owner = self.config, type(self).__name__
-        device = self.head.weight.device
-        check_input("target_history", target_history, config.history, 3, device=device, owner=owner)
-        history, turn = target_history.reshape(-1, config.history, 3), None
+        if autocast_is_on():
+            return without_autocast(self._forecast, target_history, reflected=reflected)
+        config, about = self.config, {"like": self.steps_ahead, "owner": type(self).__name__}
+        seen = network_input("target_history", target_history, config.history, 3, **about)
+        history, turn = seen.reshape(-1, config.history, 3), None
         if config.square_symmetry:
             now, before = history[:, -1, :2], history[:, -2, :2]
             # A pinch of position decides for a target that moves along an axis or lies still.
@@ -163,18 +166,22 @@ class Forecaster(Pretrained, DescribedForecast):
         if turn is not None:
             line = torch.bmm(turn, line)
         swapped = hidden.new_zeros(len(hidden), dtype=torch.bool) if turn is None else turn[:, 0, 0] == 0.0
-        return line.mT.view(*target_history.shape[:-2], config.horizon, 3), hidden, swapped
+        path = line.mT.view(*target_history.shape[:-2], config.horizon, 3)
+        return path.to(target_history.dtype), hidden, swapped
 
     def _line(self, history: Tensor) -> tuple[Tensor, Tensor]:
-        """Unreflected positions (R, 3, F) after the turned histories (R, H, 3) [m], and the last hidden layer."""
+        """Unreflected positions (R, 3, F) after the turned histories (R, H, 3) [m], and the last hidden layer.
+
+        Features and what the layers make of them have the type of the layers' weights.
+        """
         now, step = history[:, -1], history[:, 1:] - history[:, :-1]
-        newest = step[:, -1]
-        features = self._step_features(step)
+        newest, stored = step[:, -1], self.join.weight.dtype
+        features = self._step_features(step).to(stored)
         for layer in (self.embed, *self.convolve):
             features = convolve(features, layer).relu_()
-        joined = torch.cat([features.flatten(1), self._present_features(now, newest)], dim=-1)
+        joined = torch.cat([features.flatten(1), self._present_features(now, newest).to(stored)], dim=-1)
         hidden = self.hidden(self.join(joined).relu_()).relu_()
-        departure = self.head(self.mix(hidden)).view(-1, 3, self.config.horizon)
+        departure = self.head(self.mix(hidden)).view(-1, 3, self.config.horizon).to(now.dtype)
         straight = torch.addcmul(now.unsqueeze(-1), newest.unsqueeze(-1), self.step_factor)
         return torch.addcmul(straight, departure, self.departure_scale), hidden
 

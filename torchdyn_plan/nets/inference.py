@@ -1,22 +1,23 @@
 """Networks for inference: the same functions in fewer operations, with scales and layouts put into the weights.
 
-At one row a network costs what its operations cost to launch, hardly what they compute.
+At one row a network costs what its operations cost to launch, hardly what they compute. Space and time are in the same
+products as everything else: these networks are in float32 or float64, even those of networks in half precision.
 """
 
 from __future__ import annotations
 
 import copy
-import math
 from functools import partial
 from typing import TYPE_CHECKING, Any
 
 import torch
 from torch import Tensor, nn
 
-from torchdyn_plan.checks import check_choice, check_input
+from torchdyn_plan.checks import check_choice, network_input
 from torchdyn_plan.nets.arrival import ArrivalModel, ArrivalQuery
 from torchdyn_plan.nets.distributions import ESTIMATORS, Arrival, Spread, arrival_moments
 from torchdyn_plan.nets.forecast import DescribedForecast, Forecast
+from torchdyn_plan.precision import Precise, autocast_is_on, in_type_of, without_autocast
 
 if TYPE_CHECKING:
     from torchdyn_plan.nets.eta import ETANetwork
@@ -28,12 +29,13 @@ DENSE = 2**14
 
 
 def hold_constants(module: nn.Module, dtype: torch.dtype, **constants: Tensor) -> None:
-    """Register ``constants`` as buffers of ``module``: neither trained, nor saved."""
+    """Register ``constants`` as buffers of ``module``, in float32 at least: neither trained, nor saved."""
+    dtype = torch.promote_types(dtype, torch.float32)
     for name, value in constants.items():
         module.register_buffer(name, value.detach().to(dtype).contiguous(), persistent=False)
 
 
-class InferenceForecaster(DescribedForecast):
+class InferenceForecaster(Precise, DescribedForecast):
     """`Forecaster` for inference; forecasts differ by rounding alone.
 
     The one exception: with square symmetry, a target that stands still within a millimetre of a cushion is taken to
@@ -70,10 +72,11 @@ class InferenceForecaster(DescribedForecast):
         embed: Any = exact.embed
         weight = embed.weight.squeeze(-1) * exact.step_feature_scale
         hold_constants(self, dtype, embed_weight=weight.mT, embed_bias=embed.bias, zero=torch.zeros(1))
-        length, self.dense = config.history - 1, []
+        length, self.dense, self.lengths = config.history - 1, [], [config.history - 1]
         for number, layer in enumerate(exact.convolve):
             weight, bias, length, dense = _convolution(layer, length)
             self.dense.append(dense)
+            self.lengths.append(length)
             hold_constants(self, dtype, **{f"convolve_weight_{number}": weight, f"convolve_bias_{number}": bias})
         weight, bias = _join(exact)
         hold_constants(self, dtype, join_weight=weight.mT, join_bias=bias)
@@ -95,13 +98,16 @@ class InferenceForecaster(DescribedForecast):
         """The same forecast, and what a spread is told by, as `Forecaster.describe` describes."""
         forecast, hidden, turn = self._forecast(target_history)
         batch = target_history.shape[:-2]
-        return forecast, hidden.view(*batch, self.config.hidden), (turn[:, 0, 0] == 0.0).view(batch)
+        hidden = in_type_of(forecast, hidden).view(*batch, self.config.hidden)
+        return forecast, hidden, (turn[:, 0, 0] == 0.0).view(batch)
 
     def _forecast(self, target_history: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         """Positions (*B, F, 3), hidden features (R, hidden) and how each row was turned (R, 3, 7)."""
-        config = self.config
-        _check("target_history", target_history, self.head_weight.device, config.history, 3)
-        history = target_history.reshape(-1, config.history, 3)
+        config, like = self.config, self.head_weight
+        if autocast_is_on():
+            return without_autocast(self._forecast, target_history)
+        seen = network_input("target_history", target_history, config.history, 3, like=like)
+        history = seen.reshape(-1, config.history, 3)
         if config.square_symmetry:
             # The nearest of the eight octants' middles says how a row is turned, and its line turned back and shifted.
             now = history[:, -1]
@@ -116,15 +122,21 @@ class InferenceForecaster(DescribedForecast):
             level = line[:, :2]
             level.sub_(level.round()).abs_()
         path = torch.bmm(turn[..., 3:6], line).add_(turn[..., 6:])
-        return path.mT.view(*target_history.shape[:-2], config.horizon, 3), hidden, turn
+        path = path.mT.view(*target_history.shape[:-2], config.horizon, 3)
+        return path if seen is target_history else path.to(target_history.dtype), hidden, turn
 
     def predict(self, *seen: Tensor) -> Forecast:
         """The path, and its spread if there is a network that judges it."""
         path, hidden, turn = self._forecast(*seen)
-        return Forecast(path, self._spread(hidden, turn, path.shape[:-2]) if self.judged else None)
+        if not self.judged:
+            return Forecast(path)
+        spread = self._spread(hidden, turn, path.shape[:-2])
+        return Forecast(path, spread if path.dtype == hidden.dtype else Spread(*in_type_of(path, *spread)))
 
     def _spread(self, hidden: Tensor, turn: Tensor, batch: torch.Size) -> Spread:
         """What `SpreadNetwork.forward` makes of features (R, hidden) of rows that were turned (R, 3, 7)."""
+        if autocast_is_on():
+            return without_autocast(self._spread, hidden, turn, batch)
         features = torch.addmm(self.spread_hidden_bias, hidden, self.spread_hidden_weight).relu_()
         features = torch.addmm(self.spread_mix_bias, features, self.spread_mix_weight)
         out = torch.addmm(self.spread_head_bias, features, self.spread_head_weight)
@@ -134,24 +146,26 @@ class InferenceForecaster(DescribedForecast):
         level = out[:, :4].view(len(hidden), 2, 2, self.config.horizon)
         level = torch.where(swapped, level.flip(2), level).mT
         scale, shape = level[:, 0].clamp(-18.0, 4.0).exp(), level[:, 1].clamp(-3.0, 3.0).exp()
-        gone = out[:, 4].sigmoid()
-        return Spread(scale.unflatten(0, batch), shape.unflatten(0, batch), gone.unflatten(0, batch))
+        gone, horizon = out[:, 4].sigmoid(), self.config.horizon
+        scale, shape = scale.reshape(*batch, horizon, 2), shape.reshape(*batch, horizon, 2)
+        return Spread(scale, shape, gone.view(*batch, horizon))
 
     def _line(self, step: Tensor, now: Tensor, newest: Tensor) -> tuple[Tensor, Tensor]:
         """Unreflected line (R, 3, F) and hidden features; with cushions x and y count in periods of the reflection."""
         real = step.any(dim=-1, keepdim=True).to(step.dtype)
-        change = torch.addcmul(self.zero, step - step[:, -1:], real, value=1.0 / self.config.change_scale).asinh_()
+        change = torch.addcmul(self.zero, step - step[:, -1:], real, value=1.0 / self.config.change_scale).asinh()
         features = torch.cat([step, change, real], dim=-1).view(-1, 7)
         features = torch.addmm(self.embed_bias, features, self.embed_weight).relu_()
         for number, dense in enumerate(self.dense):
             if dense:
-                features = features.view(len(step), -1)
+                features = features.view(len(step), self.lengths[number] * self.config.channels)
             else:
-                steps = features.view(len(step), -1, self.config.channels)
+                steps = features.view(len(step), self.lengths[number], self.config.channels)
                 features = steps.unfold(1, 3, 2).mT.reshape(-1, 3 * self.config.channels)
             weight, bias = getattr(self, f"convolve_weight_{number}"), getattr(self, f"convolve_bias_{number}")
             features = torch.addmm(bias, features, weight).relu_()
-        joined = torch.cat([features.view(len(step), -1), now, newest, *self._ahead(now, newest)], dim=-1)
+        features = features.view(len(step), self.lengths[-1] * self.config.channels)
+        joined = torch.cat([features, now, newest, *self._ahead(now, newest)], dim=-1)
         hidden = torch.addmm(self.join_bias, joined, self.join_weight).relu_()
         hidden = torch.addmm(self.hidden_bias, hidden, self.hidden_weight).relu_()
         mixed = torch.addmm(self.mix_bias, hidden, self.mix_weight)
@@ -166,15 +180,15 @@ class InferenceForecaster(DescribedForecast):
             return ()
         place, speed = now[:, :2], newest[:, :2]
         if self.config.square_symmetry:
-            wait = (extent - place).div_(speed.clamp_min(1e-6)).clamp_(0.0, most)
+            wait = (extent - place).div_(speed.clamp_min(1e-6)).clamp(0.0, most)
         else:
             direction = torch.where(speed < 0, -1.0, 1.0)
-            wait = (extent - place * direction).div_((speed * direction).clamp_min(1e-6)).clamp_(0.0, most)
+            wait = (extent - place * direction).div_((speed * direction).clamp_min(1e-6)).clamp(0.0, most)
         period = torch.addcmul(place, speed, wait.flip(-1)).sub_(extent).mul_(0.25 / extent)
         return wait, wait.log1p(), period.sub_(period.round()).abs_()
 
 
-class InferenceETA(ArrivalModel):
+class InferenceETA(Precise, ArrivalModel):
     """`ETANetwork` for inference; scores differ by rounding alone."""
 
     state_weight: Tensor
@@ -210,33 +224,47 @@ class InferenceETA(ArrivalModel):
 
     def forward(self, robot_state: Tensor, goal: Tensor) -> Tensor:
         """Scores of the bins, ``(*B, bins + 1)``, as `ETANetwork.forward` describes."""
-        return self.scores(*self._share(robot_state), goal)
+        if autocast_is_on():
+            return without_autocast(self.forward, robot_state, goal)
+        network_input("goal", goal, 3, like=self.head_weight)
+        return self.scores(*self._share(robot_state), goal).to(goal.dtype)
 
     def arrival(self, robot_state: Tensor, goal: Tensor, *, estimator: str = "mode") -> Arrival:
         """Arrival time at ``goal (*B, 3)`` from ``robot_state (*B, S)``, as `ETANetwork.arrival` describes."""
+        network_input("goal", goal, 3, like=self.head_weight)
         return self.read(*self._share(robot_state), goal, estimator=estimator)
 
     def from_state(self, robot_state: Tensor) -> ArrivalQuery:
-        """Arrivals from ``robot_state`` (*B, S) at goals (*B, K, 3): the state's part of the work is done once."""
+        """Arrivals from ``robot_state`` (*B, S) at goals (*B, K, 3): the state's part of the work is done once.
+
+        Goals are a search's own, and not looked at.
+        """
         return partial(self.read, *self._share(robot_state.unsqueeze(-2)))
 
     def _share(self, robot_state: Tensor) -> tuple[Tensor, Tensor]:
         """The tool's place in states (*B, S), and their share of the first layer, ``(*B, hidden)``."""
-        _check("robot_state", robot_state, self.head_weight.device, self.config.robot_state_size)
-        tool_pos = robot_state[..., slice(*self.config.tool_slice)]
-        return tool_pos, nn.functional.linear(robot_state, self.state_weight.mT, self.state_bias)
+        weight, size = self.state_weight, self.config.robot_state_size
+        if autocast_is_on():
+            return without_autocast(self._share, robot_state)
+        seen = network_input("robot_state", robot_state, size, like=weight)
+        tool_pos = seen[..., slice(*self.config.tool_slice)]
+        return tool_pos, nn.functional.linear(seen, weight.mT, self.state_bias)
 
     def read(self, tool_pos: Tensor, state: Tensor, goal: Tensor, *, estimator: str = "mode") -> Arrival:
         """Arrival time at ``goal`` (*B, 3) for tools (*B, 3) and the states' share of the first layer (*B, hidden)."""
+        if autocast_is_on():
+            return without_autocast(self.read, tool_pos, state, goal, estimator=estimator)
         scores, width = self.scores(tool_pos, state, goal), self.config.bin_width
-        if estimator in ("expectation", "distribution"):
+        if goal.dtype != state.dtype:
+            scores = in_type_of(goal, scores)
+        if estimator in ("expectation", "distribution") and scores.dtype == state.dtype:
             return ESTIMATORS[estimator](scores, bin_width=width, moments=self.moments)
         check_choice("estimator", estimator, ESTIMATORS)
         return ESTIMATORS[estimator](scores, bin_width=width)
 
     def scores(self, tool_pos: Tensor, state: Tensor, goal: Tensor) -> Tensor:
         """Scores ``(*B, bins + 1)`` for tools (*B, 3), the states' share of the first layer, and goals (*B, 3)."""
-        _check("goal", goal, state.device, 3)
+        goal = goal if goal.dtype == state.dtype else goal.to(state.dtype)
         offset = goal - tool_pos
         lengths = (offset.square() @ self.square_sums).sqrt_()
         hidden = (torch.cat([goal.expand(offset.shape), lengths], dim=-1) @ self.goal_weight).add_(state).relu_()
@@ -244,15 +272,6 @@ class InferenceETA(ArrivalModel):
         rows = torch.addmm(self.third_bias, rows, self.third_weight).relu_()
         rows = torch.addmm(self.head_bias, rows, self.head_weight)
         return rows.view(*hidden.shape[:-1], self.config.bins + 1)
-
-
-def _check(name: str, tensor: Tensor, device: torch.device, *trailing: int) -> None:
-    """As `check_input`, after a quick look that passes nearly always."""
-    if torch.compiler.is_compiling():
-        return
-    if tensor.shape[-len(trailing) :] == trailing and tensor.device == device and math.isfinite(tensor.sum().item()):
-        return
-    check_input(name, tensor, *trailing, device=device, owner="the network")
 
 
 def _turns(network: Forecaster) -> Tensor:

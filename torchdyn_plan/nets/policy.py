@@ -8,10 +8,12 @@ from typing import Any
 
 import torch
 from torch import Tensor, nn
+from torch.func import debug_unwrap
 
-from torchdyn_plan.checks import check_finite, check_input, check_number
+from torchdyn_plan.checks import check_finite, check_number, network_input
 from torchdyn_plan.errors import InputError
 from torchdyn_plan.nets.pretrained import Pretrained
+from torchdyn_plan.precision import Precise, autocast_is_on, without_autocast
 
 GOAL_FEATURES = 11
 """Goal, offset from the tool, the same squashed near the goal, level and full distance."""
@@ -46,7 +48,7 @@ class PolicyConfig:
             )
 
 
-class GoalFeatures(nn.Module):
+class GoalFeatures(Precise):
     """What actor and critic see of a robot state and a goal: standardised by buffers, all of about unit size."""
 
     shift: Tensor
@@ -99,7 +101,7 @@ class Actor(Pretrained, nn.Module):
         nn.init.zeros_(final.bias)
 
     def forward(self, robot_state: Tensor, goal: Tensor) -> Tensor:
-        """Action.
+        """Action, of the goal's type.
 
         Args:
             robot_state: ``(*B, S)``.
@@ -111,17 +113,19 @@ class Actor(Pretrained, nn.Module):
         Raises:
             InputError: a trailing shape or a device is wrong, or an input holds a NaN.
         """
-        about: Any = {"device": self.features.scale.device, "owner": type(self).__name__, "finite": False}
-        check_input("robot_state", robot_state, self.config.robot_state_size, **about)
-        check_input("goal", goal, 3, **about)
-        hidden = self.features(robot_state, goal)
+        like, first = self.features.scale, next(iter(self.body))
+        if autocast_is_on():
+            return without_autocast(self.forward, robot_state, goal)
+        about: Any = {"like": like, "owner": type(self).__name__, "finite": False}
+        seen = network_input("robot_state", robot_state, self.config.robot_state_size, **about)
+        hidden = self.features(seen, network_input("goal", goal, 3, **about)).to(first.weight.dtype)
         # Looked at once, where both have come together.
-        if not torch.compiler.is_compiling() and not math.isfinite(hidden.sum().item()):
+        if not torch.compiler.is_compiling() and not math.isfinite(debug_unwrap(hidden).sum().item()):
             check_finite("robot_state", robot_state)
             check_finite("goal", goal)
         for layer in self.body:
             hidden = layer(hidden)
-        return torch.tanh(hidden)
+        return torch.tanh(hidden).to(goal.dtype)
 
 
 class Critic(nn.Module):
@@ -135,8 +139,13 @@ class Critic(nn.Module):
         self.body = _perceptron(self.features.size + config.action_size, config, 1, normalised=True)
 
     def forward(self, robot_state: Tensor, goal: Tensor, action: Tensor) -> Tensor:
-        """Value ``(*B, 1)`` of ``action`` (*B, A) for a robot state (*B, S) and a goal (*B, 3) [m, world]."""
-        return self.body(torch.cat([self.features(robot_state, goal), action], dim=-1))
+        """Value ``(*B, 1)``, of the goal's type, of ``action`` (*B, A) for a robot state (*B, S) and a goal (*B, 3)."""
+        like, first = self.features.scale, next(iter(self.body))
+        if autocast_is_on():
+            return without_autocast(self.forward, robot_state, goal, action)
+        features = self.features(robot_state.to(like.dtype), goal.to(like.dtype))
+        seen = torch.cat([features, action.to(like.dtype)], dim=-1)
+        return self.body(seen.to(first.weight.dtype)).to(goal.dtype)
 
 
 def _perceptron(inputs: int, config: PolicyConfig, outputs: int, *, normalised: bool) -> nn.Sequential:

@@ -6,12 +6,13 @@ from typing import Any
 import torch
 from torch import Tensor, nn
 
-from torchdyn_plan.checks import check_input, check_number
+from torchdyn_plan.checks import check_number, network_input
 from torchdyn_plan.errors import InputError
 from torchdyn_plan.nets.distributions import Spread
 from torchdyn_plan.nets.forecast import DescribedForecast, Forecast, ForecastModel
 from torchdyn_plan.nets.forecaster import Forecaster
 from torchdyn_plan.nets.pretrained import Pretrained
+from torchdyn_plan.precision import autocast_is_on, in_type_of, without_autocast
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -59,7 +60,7 @@ class SpreadNetwork(Pretrained, nn.Module):
             bias[2:] = torch.tensor([0.0, 0.0, -4.0]).unsqueeze(-1)
 
     def forward(self, features: Tensor, swapped: Tensor) -> Spread:
-        """Spread of the forecasts that `Forecaster.describe` describes.
+        """Spread of the forecasts that `Forecaster.describe` describes, of their type, in float32 at least.
 
         Args:
             features: ``(*B, features)``.
@@ -73,12 +74,15 @@ class SpreadNetwork(Pretrained, nn.Module):
 
     def raw(self, features: Tensor, swapped: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         """Logarithms of scale and shape (*B, F, 2) and the logit of being gone (*B, F): what training compares."""
-        device, owner = self.head.weight.device, type(self).__name__
-        check_input("features", features, self.config.features, device=device, owner=owner, finite=False)
+        weight = self.head.weight
+        if autocast_is_on():
+            return without_autocast(self.raw, features, swapped)
+        about: Any = {"like": weight, "owner": type(self).__name__, "finite": False}
+        seen = network_input("features", features, self.config.features, **about)
         if swapped.shape != features.shape[:-1] or swapped.dtype != torch.bool:
             expected = f"bool of shape {tuple(features.shape[:-1])}"
             raise InputError(f"swapped must be {expected}, got {swapped.dtype} of shape {tuple(swapped.shape)}")
-        out = self.head(self.mix(self.hidden(features).relu()))
+        out = in_type_of(features, self.head(self.mix(self.hidden(seen).relu())))
         out = out.view(*features.shape[:-1], 5, self.config.horizon)
         level = out[..., :4, :].unflatten(-2, (2, 2)).transpose(-1, -2)
         level = torch.where(swapped[..., None, None, None], level.flip(-1), level)

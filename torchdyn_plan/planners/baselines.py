@@ -73,13 +73,14 @@ class RecordedFuture(ForecastModel):
         self.horizon = horizon
 
     def predict(self, *seen: Tensor) -> Forecast:
-        """Positions at steps t+1 … t+F, ``(R, F, 3)``, of recordings ``(R, T, 3)`` [m, world] at steps t, R values."""
+        """Positions at steps t+1 … t+F, ``(*B, F, 3)``, of recordings ``(*B, T, 3)`` [m, world] at steps t ``(*B,)``."""
         target_future, step_count = seen
         check_trailing_shape(keys.TARGET_FUTURE, target_future, target_future.shape[-2], 3)
         check_finite(keys.TARGET_FUTURE, target_future)
         ahead = torch.arange(1, self.horizon + 1, device=target_future.device)
-        index = (step_count.reshape(-1, 1) + ahead).clamp(max=target_future.shape[-2] - 1)
-        return Forecast(target_future.gather(-2, index.unsqueeze(-1).expand(-1, -1, 3)))
+        index = step_count.reshape(*target_future.shape[:-2], 1).long() + ahead
+        index = index.clamp(max=target_future.shape[-2] - 1)
+        return Forecast(target_future.gather(-2, index.unsqueeze(-1).expand(*index.shape, 3)))
 
     def part_settings(self) -> dict[str, Any]:
         """Arguments that make the same model."""

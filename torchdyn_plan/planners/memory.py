@@ -11,6 +11,7 @@ import torch
 from tensordict import TensorDict, TensorDictBase
 from tensordict.nn import TensorDictModuleBase
 from torch import Tensor
+from torch.func import debug_unwrap
 
 from torchdyn_plan import keys
 from torchdyn_plan.errors import InputError
@@ -78,7 +79,7 @@ class PlannerMemory:
         # A plain dictionary: a look-up in a tensordict takes as long as a small operation.
         stored = {} if plan is None else dict(plan.items())
         fresh = observation.step_count == 0
-        some_fresh = torch.compiler.is_compiling() or bool(fresh.any())
+        some_fresh = torch.compiler.is_compiling() or bool(debug_unwrap(fresh).any())
         lost = [name for name in self.names if name not in stored]
         if lost:
             warn_of_loss(lost[0], fresh)
@@ -111,7 +112,7 @@ class PlannerMemory:
 
 def warn_of_loss(name: str, fresh: Tensor) -> None:
     """Warn if rows that are not ``fresh`` (*B,) have lost the entry ``name`` of their memory."""
-    if torch.compiler.is_compiling() or bool(fresh.all()):
+    if torch.compiler.is_compiling() or bool(debug_unwrap(fresh).all()):
         return
     warnings.warn(
         f"a planner remembers nothing ('plan', {name!r} is absent) in rows that are past step 0, and starts afresh "
@@ -138,14 +139,15 @@ class Remembering(TensorDictModuleBase):
         """Entries below ``plan`` of rows at step 0, in the batch, type and device of ``like`` (*B, 3); none here."""
         return {}
 
-    def make_tensordict_primer(self) -> Any:
+    def make_tensordict_primer(self, dtype: torch.dtype = torch.float32) -> Any:
         """A TorchRL transform that lets environments carry the memory, `torchrl.envs.TensorDictPrimer`.
 
         Environments that run in other processes, and collectors over them, carry nothing that no spec declares.
+        ``dtype`` is that of the environment's positions.
         """
         from torchrl.data import Composite, Unbounded
         from torchrl.envs.transforms import TensorDictPrimer
 
-        entries = self.empty_memory(torch.zeros(3))
+        entries = self.empty_memory(torch.zeros(3, dtype=dtype))
         specs = {name: Unbounded(shape=value.shape, dtype=value.dtype) for name, value in entries.items()}
         return TensorDictPrimer(Composite({keys.PLAN: Composite(specs)}), default_value=0.0, expand_specs=True)

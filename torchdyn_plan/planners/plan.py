@@ -8,6 +8,7 @@ from typing import NamedTuple, Protocol
 
 import torch
 from torch import Tensor
+from torch.func import debug_unwrap
 
 from torchdyn_plan.checks import check_number
 from torchdyn_plan.planners.observation import Observation
@@ -118,7 +119,7 @@ class Plan(NamedTuple):
 
     def held(self, rows: Tensor, tool_pos: Tensor) -> Plan:
         """The plan, but ``rows`` (*B,) bool stay where their tool is, (*B, 3) [m, world]."""
-        if not (torch.compiler.is_compiling() or rows.any()):
+        if not (torch.compiler.is_compiling() or debug_unwrap(rows).any()):
             return self
         return self._replace(
             goal=torch.where(rows.unsqueeze(-1), tool_pos, self.goal),
@@ -147,12 +148,17 @@ def input_status(observation: Observation, lost: Lost | None) -> Tensor:
     # A sum is finite only if all its terms are.
     total = target_pos.sum(-1)
     for value in observation.seen:
-        total = total + value.reshape(*total.shape, -1).sum(-1)
+        total = total + value.reshape(*total.shape, value.shape[total.ndim :].numel()).sum(-1)
     bad = (~torch.isfinite(total)) * int(PlanStatus.BAD_INPUT)
     return bad if lost is None else torch.maximum(bad, lost.seen(target_pos) * int(PlanStatus.TARGET_LOST))
 
 
 def usable_path(path: Tensor, target_pos: Tensor) -> tuple[Tensor, Tensor]:
-    """The path ``(*B, F, 3)``, a target at rest at ``target_pos`` (*B, 3) where it is of no use, and its use (*B,)."""
+    """The path ``(*B, F, 3)``, a target at rest at ``target_pos`` (*B, 3) where it is of no use, and its use (*B,).
+
+    Whatever forecasts it, the path has the type of the target's position.
+    """
+    if path.dtype != target_pos.dtype:
+        path = path.to(target_pos.dtype)
     usable = path.abs().amax((-2, -1), keepdim=True) <= FARTHEST
     return torch.where(usable, path, target_pos.unsqueeze(-2)), usable.view(target_pos.shape[:-1])

@@ -8,9 +8,10 @@ from functools import partial
 import torch
 from tensordict import TensorDictBase
 from torch import Tensor
+from torch.func import debug_unwrap
 
 from torchdyn_plan import keys
-from torchdyn_plan.checks import check_trailing_shape
+from torchdyn_plan.checks import check_trailing_shape, hides_values
 from torchdyn_plan.nets.forecast import Forecast, ForecastModel
 from torchdyn_plan.planners.observation import SEEN_BY_ALL, Observation
 from torchdyn_plan.planners.parts import ComposedPlanner
@@ -19,6 +20,7 @@ from torchdyn_plan.planners.protocol import read
 from torchdyn_plan.planners.rows import apply_to_rows
 from torchdyn_plan.planners.schedule import lateness
 from torchdyn_plan.planners.search.meeting import SearchContext, later
+from torchdyn_plan.precision import HALVES
 
 
 class DynamicPlanner(ComposedPlanner):
@@ -42,7 +44,7 @@ class DynamicPlanner(ComposedPlanner):
         ticked, due = self.schedule.tick(clock, obs, plan, busy=busy, late=late)
         trouble = input_status(obs, self.lost)
         planned, holds = due, ~plan.usable
-        if self.delivery is not None or torch.compiler.is_compiling() or due.any():
+        if self.delivery is not None or torch.compiler.is_compiling() or debug_unwrap(due).any():
             able = due & (trouble == 0)
             make = partial(replan_rows, self.replan, chunk=self.chunk)
             if self.delivery is None:
@@ -50,7 +52,7 @@ class DynamicPlanner(ComposedPlanner):
             else:
                 made, pending = self.delivery.order(make, able, obs, plan, pending)
             planned = able & made.usable
-            if torch.compiler.is_compiling() or (due & ~planned).any():
+            if torch.compiler.is_compiling() or debug_unwrap(due & ~planned).any():
                 ticked = ticked.retry(due & ~planned, clock)
             holds = (due & ~able) | ~plan.usable
 
@@ -80,11 +82,15 @@ class DynamicPlanner(ComposedPlanner):
 
 
 def observe(tensordict: TensorDictBase, forecaster: ForecastModel) -> Observation:
-    """What a planner with this ``forecaster`` sees; raises `InputError` for a missing key or a wrong shape."""
+    """What a planner with this ``forecaster`` sees; raises `InputError` for a missing key or a wrong shape.
+
+    Half precision becomes float32, and a step count of any type int64.
+    """
     wanted = (*SEEN_BY_ALL, *forecaster.in_keys)
     values = [tensordict.get(key, None) for key in wanted]
     if any(value is None for value in values):
         values = [read(tensordict, key, "DynamicPlanner") for key in wanted]
+    values = [value.float() if value.dtype in HALVES else value for value in values]
     tool_pos, target_pos, robot_state, step_count, *seen = values
     if not torch.compiler.is_compiling():
         if tool_pos.shape[-1:] != (3,) or target_pos.shape[-1:] != (3,):
@@ -95,7 +101,10 @@ def observe(tensordict: TensorDictBase, forecaster: ForecastModel) -> Observatio
             length = forecaster.history or history.shape[-2]
             if history.shape[-2:] != (length, 3):
                 check_trailing_shape(keys.TARGET_HISTORY, history, length, 3)
-    return Observation(tool_pos, target_pos, robot_state, step_count.reshape(tool_pos.shape[:-1]), tuple(seen))
+    step_count = step_count.reshape(tool_pos.shape[:-1])
+    if step_count.dtype != torch.int64:
+        step_count = step_count.long()
+    return Observation(tool_pos, target_pos, robot_state, step_count, tuple(seen))
 
 
 def replan_rows(
@@ -119,7 +128,7 @@ def replan_rows(
     """
     # Planning reads no old path: rows are gathered without it.
     bare = plan._replace(path=plan.path[..., :0, :])
-    if not torch.compiler.is_compiling():
+    if not hides_values(rows):
         if not rows.any():
             return others
         # Models are given one batch dimension, whatever the planner has.

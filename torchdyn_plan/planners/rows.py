@@ -4,11 +4,14 @@ from collections.abc import Callable, Sequence
 
 import torch
 from torch import Tensor
+from torch.func import debug_unwrap
+
+from torchdyn_plan.checks import hides_values
 
 
 def any_row(mask: Tensor) -> bool:
     """Whether ``mask`` holds anywhere, so that work for none can be left out; always true while compiling."""
-    return torch.compiler.is_compiling() or bool(mask.any())
+    return torch.compiler.is_compiling() or bool(debug_unwrap(mask).any())
 
 
 def where_rows(mask: Tensor, new: Tensor, old: Tensor) -> Tensor:
@@ -28,7 +31,8 @@ def apply_to_rows(
 
     Matrix products may differ in the last bit with the number of rows. With ``chunk`` the function always sees exactly
     that many rows (a row is repeated to fill the last block), so that a row's result depends on that row alone.
-    While compiling, where the number of rows must not depend on data, the function sees all of them.
+    While compiling and under ``torch.vmap``, where the number of rows must not depend on data, the function sees all of
+    them.
 
     Args:
         function: maps tensors with one leading batch dimension, ``(R, …)`` each, to as many tensors as ``outputs``.
@@ -41,7 +45,7 @@ def apply_to_rows(
     Returns:
         New tensors of the shapes and types of ``outputs``.
     """
-    if torch.compiler.is_compiling():
+    if hides_values(mask):
         made = function(*(_flat(value, mask.ndim) for value in inputs))
         pairs = zip(made, outputs, strict=True)
         return tuple(where_rows(mask, new.to(old.dtype).reshape(old.shape), old) for new, old in pairs)

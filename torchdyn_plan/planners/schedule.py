@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, ClassVar, NamedTuple, Protocol
 
 import torch
 from torch import Tensor
+from torch.func import debug_unwrap
 
 from torchdyn_plan.checks import check_number
 from torchdyn_plan.errors import InputError
@@ -140,7 +141,7 @@ class ReplanSchedule:
     ) -> tuple[Clock, Tensor]:
         """Which rows plan now, as `Schedule.tick` says, whatever has become of the plan."""
         over = clock.countdown <= 0
-        if not (torch.compiler.is_compiling() or over.any()):
+        if not (torch.compiler.is_compiling() or debug_unwrap(over).any()):
             return clock, over
         due = over if busy is None else over & ~busy
         window = torch.where(due, self.next_window(clock.window), clock.window)

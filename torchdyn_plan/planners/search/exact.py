@@ -12,6 +12,7 @@ from torch import Tensor
 from torchdyn_plan.checks import check_number, check_trailing_shape
 from torchdyn_plan.errors import InputError
 from torchdyn_plan.planners.search.meeting import NO_CONTEXT, Meeting, SearchContext
+from torchdyn_plan.precision import exact_product
 
 if TYPE_CHECKING:
     from torchdyn_plan.nets.arrival import ArrivalQuery
@@ -296,11 +297,11 @@ def choose_nearby(
     place = (torch.arange(count, device=goals.device) / coarse).clamp(max=eta_steps.shape[-1] - 1)
     nodes = torch.arange(eta_steps.shape[-1], device=goals.device).unsqueeze(-1)
     shares = (1.0 - (place - nodes).abs()).clamp_min(0.0).to(eta_steps.dtype)
-    guess, _ = choose(eta_steps.clamp(max=1e4) @ shares)
+    guess, _ = choose(exact_product(eta_steps.clamp(max=1e4), shares))
     # Goals before the guess may do as well, and were not asked for; after it, the next one asked for is not far.
     width = min(coarse + 1, count)
     window = (guess - coarse + 1).clamp(0, count - width) + torch.arange(width, device=goals.device)
-    known = torch.full(goals.shape[:-1], torch.inf, dtype=eta_steps.dtype, device=goals.device)
+    known = torch.full_like(goals[..., 0], torch.inf, dtype=eta_steps.dtype)
     known[..., ::coarse] = eta_steps
     nearby = goals.gather(-2, window.unsqueeze(-1).expand(*window.shape, 3))
     return choose(known.scatter(-1, window, ask(nearby)))

@@ -23,6 +23,7 @@ from torchdyn_plan.planners.search.exact import (
     check_context,
 )
 from torchdyn_plan.planners.search.meeting import NO_CONTEXT, Meeting, SearchContext
+from torchdyn_plan.precision import exact_product
 
 if TYPE_CHECKING:
     from torchdyn_plan.nets.arrival import ArrivalQuery
@@ -93,7 +94,7 @@ class SoftExactSearch:
         worth = self.point * candidates.score / heat + strict * (gate - _apart(candidates) / heat)
         weights = worth.softmax(dim=-1)
         return Meeting(
-            goal=(weights.unsqueeze(-2) @ candidates.goals).squeeze(-2),
+            goal=exact_product(weights.unsqueeze(-2), candidates.goals).squeeze(-2),
             arrival_steps=(weights * target_steps).sum(dim=-1),
             clamped=torch.zeros_like(target_pos[..., 0], dtype=torch.bool),
             reachable=(weights * gate.exp()).sum(dim=-1) > 0.25,
@@ -136,7 +137,7 @@ class SoftCornerSearch:
         miss = torch.linalg.vector_norm(corners - met, dim=-1)
         weights = ((logsigmoid((0.5 - never) / heat) - miss) / heat).softmax(dim=-1)
         return Meeting(
-            goal=(weights.unsqueeze(-2) @ met).squeeze(-2),
+            goal=exact_product(weights.unsqueeze(-2), met).squeeze(-2),
             arrival_steps=(weights * steps.clamp(0.0, horizon)).sum(dim=-1),
             clamped=(weights * (steps > horizon)).sum(dim=-1) + (here.squeeze(-1) > horizon) > 0.5,
             reachable=(weights * never).sum(dim=-1) < 0.5,

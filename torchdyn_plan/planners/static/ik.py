@@ -9,6 +9,7 @@ from typing import Any, NamedTuple, cast
 import torch
 from tensordict import TensorDictBase
 from torch import Tensor, nn
+from torch.func import debug_unwrap
 
 from torchdyn_plan import keys
 from torchdyn_plan.checks import check_finite, check_number, check_trailing_shape
@@ -21,6 +22,7 @@ from torchdyn_plan.planners.memory import remember, warn_of_loss
 from torchdyn_plan.planners.protocol import read
 from torchdyn_plan.planners.static.approach import Approach, StraightToGoal
 from torchdyn_plan.planners.static.base import StaticPlannerModule
+from torchdyn_plan.precision import Precise
 
 
 class Path(NamedTuple):
@@ -37,7 +39,7 @@ class Path(NamedTuple):
 PATH_NAMES = tuple(f"path_{field}" for field in Path._fields)
 
 
-class IKPlanner(StaticPlannerModule):
+class IKPlanner(Precise, StaticPlannerModule):
     """Drives an arm's tool to ``goal`` by inverse kinematics, in the way that its approach says.
 
     Reads ``joint_pos`` (*B, N) [rad], ``goal`` (*B, 3) [m, world] and ``step_count`` (*B,); writes ``action`` (*B, N)
@@ -100,7 +102,7 @@ class IKPlanner(StaticPlannerModule):
         joint_pos, goal, step_count = values
         if not torch.compiler.is_compiling():
             fits = joint_pos.shape[-1:] == self._limit.shape and goal.shape == (*joint_pos.shape[:-1], 3)
-            if not (fits and math.isfinite(goal.sum().item())):
+            if not (fits and math.isfinite(debug_unwrap(goal).sum().item())):
                 self._check(joint_pos, goal)
         path_pos, path_step = self._recall(tensordict.get(keys.PLAN, None), joint_pos, goal, step_count)
         blocks = self.chunk is not None and self._fused is None

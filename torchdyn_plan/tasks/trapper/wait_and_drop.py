@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING, ClassVar, NamedTuple, Self
 
 import torch
 from torch import Tensor
+from torch.func import debug_unwrap
 
 from torchdyn_plan.checks import check_number
 from torchdyn_plan.planners.observation import Observation
@@ -213,14 +214,14 @@ class WaitAndDrop:
         above = tool_pos[..., 2] > self.begin_above * 2 * self.drop.radius
         tool_step = tool_pos - state.tool_before
         may_begin = may_begin & above & self.drop.may_enclose(path, tool_pos, tool_step)
-        if torch.compiler.is_compiling() or may_begin.any():
+        if torch.compiler.is_compiling() or debug_unwrap(may_begin).any():
             clearance = self.drop.clearance(path, tool_pos, tool_step)
             best = (clearance.argmax(-1) == 0) & (clearance[..., 0] > 0.0)
             # The table's top is at z = 0: a ball that is expected below falls into a pocket.
             on_table = (path[..., 2] > 0.0).all(-1)
             drop_step = drop_step.masked_fill(may_begin & best & on_table, 0)
         goal = plan.goal
-        if torch.compiler.is_compiling() or (drop_step >= 0).any():
+        if torch.compiler.is_compiling() or debug_unwrap(drop_step >= 0).any():
             drop_step = drop_step.masked_fill(self._has_missed(drop_step, observation), -1)
             goal = torch.where((drop_step >= 0).unsqueeze(-1), self._goal(drop_step, path, tool_pos), goal)
         return goal, DropState(drop_step, tool_pos)
