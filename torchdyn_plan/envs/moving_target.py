@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from abc import abstractmethod
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from typing import Any, ClassVar, NamedTuple
 
 import numpy as np
@@ -148,11 +148,11 @@ class MovingTargetEnv(EnvBase):
         """A picture of environment ``row`` now, ``(height, width, 3)`` uint8, of tasks that can draw themselves."""
         raise InputError(f"{type(self).__name__} draws no pictures")
 
-    def _reward(self, observed: TensorDict) -> Tensor:
+    def _reward(self, observed: Mapping[str, Tensor]) -> Tensor:
         """Rewards ``(N, 1)`` of a step after which ``observed`` is seen: 1 where the first flag holds."""
         return observed[self.flags[0]].float()
 
-    def _terminated(self, observed: TensorDict) -> Tensor:
+    def _terminated(self, observed: Mapping[str, Tensor]) -> Tensor:
         """Whether an episode ends of itself, ``(N, 1)`` bool: where any flag holds."""
         return torch.stack([observed[flag] for flag in self.flags]).any(0)
 
@@ -257,22 +257,18 @@ class MovingTargetEnv(EnvBase):
             episodes = self._take_episodes(rows)
             self._episode[rows], self._steps[rows] = episodes, 0
             self._trace[rows] = self._start(rows, episodes).unsqueeze(1)
-        result = self._observe()
-        for key in ENDS:
-            result[key] = torch.zeros(self.num_envs, 1, dtype=torch.bool)
-        return self._shown(result)
+        return self._shown(self._observe() | {key: torch.zeros(self.num_envs, 1, dtype=torch.bool) for key in ENDS})
 
     def _step(self, tensordict: TensorDictBase) -> TensorDictBase:
         self._see(self._advance(self._checked_action(tensordict)))
-        result = self._observe()
-        terminated, truncated = self._terminated(result), self._is_over
-        result["reward"] = self._reward(result)
-        result["terminated"], result["truncated"], result["done"] = terminated, truncated, terminated | truncated
-        return self._shown(result)
+        seen = self._observe()
+        terminated, truncated = self._terminated(seen), self._is_over
+        ends = {"terminated": terminated, "truncated": truncated, "done": terminated | truncated}
+        return self._shown(seen | ends | {"reward": self._reward(seen)})
 
-    def _shown(self, result: TensorDict) -> TensorDictBase:
-        """``result`` where it is shown: the one move between devices."""
-        return result if self.device == result.device else result.to(self.device)
+    def _shown(self, entries: dict[str, Tensor]) -> TensorDictBase:
+        """``entries`` where they are shown: the one move between devices."""
+        return TensorDict(entries, batch_size=self.batch_size, device=self.device)
 
     def _checked_action(self, tensordict: TensorDictBase) -> Tensor:
         """The action (N, A); raises `InputError` where it has another shape or holds no number."""
@@ -305,7 +301,7 @@ class MovingTargetEnv(EnvBase):
             entries |= dict(self._reset(TensorDict({"_reset": done}, batch_size=self.batch_size)).items())
         return tensordict, TensorDict(entries, batch_size=self.batch_size, device=self.device)
 
-    def _observe(self) -> TensorDict:
+    def _observe(self) -> dict[str, Tensor]:
         """What is seen now, on the CPU; every entry has a memory of its own."""
         robot, history = self._robot(), self._trace.clone()
         target = history[:, -1].clone()
@@ -331,4 +327,4 @@ class MovingTargetEnv(EnvBase):
         entries |= {key: flag.unsqueeze(-1).clone() for key, flag in self._flags().items()}
         if self.static_target:
             entries[keys.GOAL] = target.clone()
-        return TensorDict(entries, batch_size=self.batch_size, device=torch.device("cpu"))
+        return entries

@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
 import torch
-from tensordict import TensorDict
 from torch import Tensor
 
 from torchdyn_plan.checks import check_choice, check_number
@@ -149,10 +149,10 @@ class DynamicReachEnv(MovingTargetEnv):
     def _is_there(self) -> Tensor:
         return is_at(self.simulation.tool_pos, self._goal, threshold=self.threshold)
 
-    def _reward(self, observed: TensorDict) -> Tensor:
+    def _reward(self, observed: Mapping[str, Tensor]) -> Tensor:
         return reach_reward(self.simulation.tool_pos, self._goal, threshold=self.threshold)
 
-    def _terminated(self, observed: TensorDict) -> Tensor:
+    def _terminated(self, observed: Mapping[str, Tensor]) -> Tensor:
         return torch.zeros(self.num_envs, 1, dtype=torch.bool)
 
     def _places(self) -> Tensor:

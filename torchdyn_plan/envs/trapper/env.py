@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
 import torch
-from tensordict import TensorDict
 from torch import Tensor, nn
 
 from torchdyn_plan.checks import check_number
@@ -124,7 +124,7 @@ class TrapperEnv(MovingTargetEnv):
         self._held = torch.where(covered, self._held + 1, 0)
         return ball
 
-    def _reward(self, observed: TensorDict) -> Tensor:
+    def _reward(self, observed: Mapping[str, Tensor]) -> Tensor:
         trapped = observed[TRAPPED]
         if not self.static_target:
             return trapped.float()

@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
 import torch
-from tensordict import TensorDict
 from torch import Tensor
 from torchrl.data import Unbounded
 
@@ -91,13 +91,13 @@ class TrapperGoalEnv(TrapperEnv):
     def _goal_at(self, steps: Tensor) -> Tensor:
         return self._goals[torch.arange(self.num_envs), steps.clamp(max=self._goals.shape[1] - 1)]
 
-    def _observe(self) -> TensorDict:
-        return super()._observe().set(TOOL_ROTATION, self._tool_rotation.clone())
+    def _observe(self) -> dict[str, Tensor]:
+        return super()._observe() | {TOOL_ROTATION: self._tool_rotation.clone()}
 
-    def _reward(self, observed: TensorDict) -> Tensor:
+    def _reward(self, observed: Mapping[str, Tensor]) -> Tensor:
         return goal_reward(self.scene, self.weights, self._tool_pos, self._tool_rotation, self._sought)
 
-    def _terminated(self, observed: TensorDict) -> Tensor:
+    def _terminated(self, observed: Mapping[str, Tensor]) -> Tensor:
         return torch.zeros(self.num_envs, 1, dtype=torch.bool)
 
     def _flags(self) -> dict[str, Tensor]:
