@@ -23,7 +23,7 @@ from study import Output, Row, Study, told
 from torch import Tensor, nn
 
 from torchdyn_plan import keys
-from torchdyn_plan.envs.trapper.gym_env import TrapperGymEnv
+from torchdyn_plan.envs.gym_env import GoalGymEnv
 from torchdyn_plan.nets.policy import GoalFeatures, PolicyConfig
 from torchdyn_plan.tasks.trapper.policy import TrapperGoalTask
 from torchdyn_plan.training.ddpg import DDPG
@@ -146,8 +146,12 @@ def train_peer(task: TrapperGoalTask, study: Study, arguments: Arguments, statis
     recipe, config = DDPGRecipe(seed=arguments.seed), task.policy_config
     envs = DummyVecEnv(
         [
-            lambda number=number: TrapperGymEnv(
-                seed=1000 * arguments.seed + number, period=task.period, max_steps=task.length, num_threads=1
+            lambda number=number: GoalGymEnv(
+                "torchdyn_plan.envs.trapper.gym_forms:STATIC",
+                seed=1000 * arguments.seed + number,
+                period=task.period,
+                max_steps=task.length,
+                num_threads=1,
             )
             for number in range(arguments.num_envs)
         ]

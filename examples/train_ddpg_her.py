@@ -60,7 +60,7 @@ collector = Collector(
 )
 
 for number, episodes in enumerate(collector):
-    replay.extend_episodes(episodes.select(*SEEN, "action", *(("next", key) for key in AFTER)))
+    replay.extend(episodes.select(*SEEN, "action", *(("next", key) for key in AFTER)))
     if number > 0:
         for _ in range(arguments.updates):
             losses = loss(replay.sample())

@@ -19,6 +19,7 @@ SMALL = {
     "forecast_gain": "--episodes 2 --seeds 0 --velocity 5",
     "former_latency": "--former . --planners corner --statics ik --processes 1 --rounds 1 --seconds 0.01 --calls plan",
     "joint_speeds": "--episodes 4 --num-envs 4",
+    "loops": "--planners corner --episodes 4 --steps 30 --loops rollout",
     "latency": "--velocities 5 --episodes 2 --latencies 0 20 --not-compensated 20",
     "reach_ceiling": "--velocities 0.03 --episodes 8 --other-velocities 0.03 --other-episodes 8 --bounds-alone",
     "reach_env": "--copies 2 --steps 4 --threads 1",

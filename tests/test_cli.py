@@ -68,6 +68,7 @@ def helped(words, capsys):
         ["train", "forecaster"],
         ["train", "policy"],
         ["train", "dher", "--task", "fetch_reach"],
+        *(["bench", name] for name in ("replan", "env", "kinematics")),
     ],
     ids=" ".join,
 )
@@ -130,6 +131,21 @@ def test_each_network_shows_its_own_options_alone(capsys):
         assert name in overview
 
 
+def test_each_benchmark_shows_its_own_options_alone(capsys):
+    replan, env, kinematics = (helped(["bench", name], capsys) for name in ("replan", "env", "kinematics"))
+    for word in ("--planner", "--batches", "--seconds", "--threads", "--device", "wait_and_drop", "{ik,rl}"):
+        assert word in replan
+        assert word not in env
+        assert word not in kinematics
+    for word in ("--task", "--out"):
+        assert all(word in shown for shown in (replan, env, kinematics))
+    assert "--compiled" in replan
+    assert "--compiled" in kinematics
+    assert "--compiled" not in env
+    assert "{proportional,rl}" in helped(["bench", "replan", "--task", "fetch_reach"], capsys)
+    assert all(name in helped(["bench"], capsys) for name in ("replan", "env", "kinematics"))
+
+
 BAD = [
     (["evaluate", "--planners", "pursit"], "unknown planner of trapper 'pursit' (did you mean 'pursuit'?)"),
     (["evaluate", "--planners", "pursuit", "pursuit"], "planners must be named once each"),
@@ -181,6 +197,17 @@ BAD = [
         "workers must divide num_envs 3",
     ),
     (["bench", "repaln"], "unknown benchmark 'repaln' (did you mean 'replan'?)"),
+    (["bench", "replan", "--planner", "cornr"], "unknown planner of trapper 'cornr' (did you mean 'corner'?)"),
+    (["bench", "replan", "--planner", "no.such.module:X"], "no planner at 'no.such.module:X': No module named 'no'"),
+    (["bench", "replan", "--planner", "{folder}"], "folder '{folder}' holds no planner"),
+    (["bench", "replan", "--planner", "corner", "--planner", "corner"], "planners must be named once each"),
+    (["bench", "replan", "--device", "gpu"], "device 'gpu' cannot be used"),
+    (["bench", "replan", "--batches", "1", "0"], "batches must be >= 1, got 0"),
+    (["bench", "replan", "--seconds", "nan"], "seconds must be a finite number, got nan"),
+    (["bench", "replan", "--threads", "-1"], "threads must be >= 0, got -1"),
+    (["bench", "replan", "--static", "kuka"], "unknown static planner of trapper 'kuka'"),
+    (["bench", "replan", "--weights", "{new}"], "no weights"),
+    (["bench", "replan", "--out", "{folder}"], "output file '{folder}' is a folder"),
     (["bench", "env", "--out", "{file}/env.json"], "output folder '{file}' is not writable"),
     (["bench", "env", "--out", "{folder}"], "output file '{folder}' is a folder"),
 ]
@@ -264,6 +291,40 @@ def test_a_task_of_another_module_is_found_from_the_working_folder(tmp_path, cap
     assert "How far the point drifts [m a step]. (default: 0.01)" in shown
     code, _, err = answer(["train", "forecaster", "--task", "tests.evaluation.toy_task:TASK"], capsys)
     assert (code, err) == (2, "torchdyn-plan: error: drift has no network to train\n")
+
+
+def test_bench_replan_prints_and_writes_the_planners_that_are_named(tmp_path, capsys):
+    out = tmp_path / "figures.json"
+    words = ["bench", "replan", "--planner", "tests.bench.own:PLANNER", "--planner", "pursuit", "--batches", 1, 3]
+    code, shown, err = answer([*words, "--seconds", 0, "--threads", 1, "--out", out], capsys)
+    assert code == 0, err
+    content = json.loads(out.read_text())
+    lines = shown.splitlines()
+    assert len(lines) == len(content["rows"])
+    for line, row in zip(lines, content["rows"], strict=True):
+        assert line.startswith(f"what {row['what']}  implementation {row['implementation']}  compiled False")
+    assert {"re-plan, tests.bench.own:PLANNER", "step, pursuit"} <= {row["what"] for row in content["rows"]}
+    assert {row["batch"] for row in content["rows"]} == {1, 3}
+    assert content["complete"]
+    assert content["config"]["batches"] == [1, 3]
+
+
+def test_a_bench_that_is_killed_has_written_what_it_measured(tmp_path):
+    out = tmp_path / "figures.json"
+    words = f"bench replan --planner corner --batches 1 --seconds 2 --out {out}".split()
+    run = subprocess.Popen(
+        [sys.executable, "-c", "from torchdyn_plan.cli import main; main()", *words],
+        stdout=subprocess.PIPE,
+        stderr=subprocess.DEVNULL,
+        text=True,
+    )
+    first = run.stdout.readline()
+    run.kill()
+    run.communicate()
+    content = json.loads(out.read_text())
+    assert first.startswith(f"what {content['rows'][0]['what']} ")
+    assert len(content["rows"]) in {1, 2}
+    assert not content["complete"]
 
 
 def outcome(settings, seed):

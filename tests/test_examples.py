@@ -16,7 +16,12 @@ EXAMPLES = Path(__file__).parent.parent / "examples"
         ("train_ddpg_her.py --rounds 2 --num-envs 2 --updates 2", "round    2: mean reward"),
         ("06_any_planner.py", "wait_and_drop, mj_jac"),
         ("05_real_time_loop.py", "plans came into use"),
+        ("bench_own_planner.py", "re-plan, mine, for inference"),
         ("07_fine_tune_forecaster.py", "after: miss 0.0"),
+        ("fine_tune_in_rollout.py --balls 4 --rounds 2 --steps 150", "round 2: "),
+        ("collect_in_parallel.py --balls 2 --steps 120", "of 4 balls, "),
+        ("stock_torchrl.py --frames 400 --warmup 200 --batch 32", "400 frames: return"),
+        ("sb3_her.py --steps 250", "after 250 steps"),
     ],
 )
 def test_example_runs(name, says, tmp_path):

@@ -26,9 +26,10 @@ MAY_IMPORT = {
     "evaluation": STUDIES,
     "bench": STUDIES | {"evaluation"},
     "cli": STUDIES | {"training", "evaluation", "bench"},
+    "gym": set(),
 }
 TASKS = sorted(folder.name for folder in (ROOT / "tasks").iterdir() if (folder / "task.py").is_file())
-FACES = {ROOT / "envs" / "__init__.py", ROOT / "tasks" / "__init__.py"}
+FACES = {ROOT / "envs" / "__init__.py", ROOT / "tasks" / "__init__.py", ROOT / "gym.py"}
 """Modules that say where the environments of tasks are, and which task commands take that name none."""
 SIMULATION = {"torchrl", "mujoco", "matplotlib"}
 HEAVY = SIMULATION | {"pytorch_kinematics", "torch", "tensordict", "numpy"}

@@ -101,6 +101,15 @@ def check_number(
         raise InputError(f"{name} must be {bounds}, got {value!r}")
 
 
+def check_device(device: torch.device | str) -> None:
+    """Raise `InputError` unless ``device`` names a device that is here."""
+    try:
+        torch.empty(1, device=device)
+    except (RuntimeError, AssertionError) as error:
+        reason = str(error).splitlines()[0]
+        raise InputError(f"device {str(device)!r} cannot be used: {reason}") from error
+
+
 def check_writable_folder(folder: Path) -> Path:
     """Create ``folder`` if needed and return it; raise `OutputError` if it cannot be written to."""
     try:

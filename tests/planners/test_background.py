@@ -126,6 +126,18 @@ def test_a_thread_of_its_own_plans_and_its_errors_come_to_the_loop():
         planner(td)
 
 
+def test_a_plan_under_way_that_is_dropped_is_forgotten():
+    delivery = Background(latency=1, deadline=3)
+    planner = make_planner(schedule=SCHEDULE, delivery=delivery)
+    for _ in range(3):
+        td = planner(observation((4,), step=SCHEDULE.first_step))
+        assert td["plan", "replanned"].all()
+        assert not planner(observation((4,), step=SCHEDULE.first_step))["plan", "replanned"].any()
+        delivery.drop()
+    delivery.drop()
+    delivery.close()
+
+
 def test_measured_latency_counts_steps_upwards():
     assert measured_latency(lambda: None, 100.0, runs=3) == 1
     calls = []

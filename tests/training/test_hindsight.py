@@ -60,7 +60,7 @@ def test_relabels_within_the_episode_before_and_after_the_storage_wraps(blocks: 
     torch.manual_seed(blocks)
     buffer = HindsightReplayBuffer(reward, capacity=6 * LENGTH + 3, length=LENGTH, batch_size=64)
     for block in range(blocks):
-        buffer.extend_episodes(episodes(4 * block, 4))
+        buffer.extend(episodes(4 * block, 4))
     stored = min(4 * blocks, 6)
     assert len(buffer) == stored * LENGTH
     for _ in range(20):
@@ -70,7 +70,7 @@ def test_relabels_within_the_episode_before_and_after_the_storage_wraps(blocks: 
 def test_goals_are_spread_over_the_whole_future() -> None:
     torch.manual_seed(0)
     buffer = HindsightReplayBuffer(reward, capacity=LENGTH, length=LENGTH, batch_size=4000, her_ratio=1.0)
-    buffer.extend_episodes(episodes(0, 1))
+    buffer.extend(episodes(0, 1))
     sample = buffer.sample()
     first = sample[keys.OBSERVATION][:, 1] == 0
     counts = torch.bincount(sample[keys.DESIRED_GOAL][first, 1].long(), minlength=LENGTH + 1)[1:]
@@ -80,10 +80,10 @@ def test_goals_are_spread_over_the_whole_future() -> None:
 def test_restored_buffer_gives_the_same_samples() -> None:
     buffer, copy = (HindsightReplayBuffer(reward, capacity=6 * LENGTH, length=LENGTH, batch_size=16) for _ in range(2))
     for block in range(2):
-        buffer.extend_episodes(episodes(4 * block, 4))
+        buffer.extend(episodes(4 * block, 4))
     copy.restore(buffer.tensors(), buffer.cursor)
     for kept in (buffer, copy):
-        kept.extend_episodes(episodes(50, 1))
+        kept.extend(episodes(50, 1))
     samples = []
     for kept in (buffer, copy):
         torch.manual_seed(3)
@@ -96,5 +96,22 @@ def test_refuses_what_is_no_whole_episode() -> None:
     with pytest.raises(InputError, match="capacity must hold an episode of 7 transitions, got 6"):
         HindsightReplayBuffer(reward, capacity=6, length=LENGTH, batch_size=16)
     buffer = HindsightReplayBuffer(reward, capacity=70, length=LENGTH, batch_size=16)
-    with pytest.raises(InputError, match="episodes must have 7 transitions, got 5"):
-        buffer.extend_episodes(episodes(0, 2)[:, :5])
+    with pytest.raises(InputError, match=r"episodes must have 7 transitions, got a batch of \(2, 5\)"):
+        buffer.extend(episodes(0, 2)[:, :5])
+    flat = episodes(0, 4).reshape(-1)
+    with pytest.raises(InputError, match=r"whole episodes of 7, got a batch of \(20,\)"):
+        buffer.extend(flat[3:23])
+    with pytest.raises(InputError, match="whole episodes of 7, got some that end elsewhere"):
+        buffer.extend(flat[3:24])
+    with pytest.raises(InputError, match="whole episodes of 7, got one"):
+        buffer.add(flat[0])
+    assert len(buffer) == 0
+
+
+def test_takes_what_torchrls_loops_have() -> None:
+    one, other = (HindsightReplayBuffer(reward, capacity=6 * LENGTH, length=LENGTH, batch_size=16) for _ in range(2))
+    one.extend(episodes(0, 4))
+    other.extend(episodes(0, 4).reshape(-1))
+    for name, value in one.tensors().items():
+        assert torch.equal(value, other.tensors()[name]), name
+    assert other.sample().batch_size == (16,)

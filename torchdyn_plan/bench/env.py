@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from functools import partial
+from pathlib import Path
 from typing import Any
 
 import torch
@@ -11,6 +12,7 @@ from mujoco.batch import Batch
 from tensordict import TensorDictBase
 
 from torchdyn_plan import keys
+from torchdyn_plan.bench.record import Record, Row
 from torchdyn_plan.bench.tape import RawSimulation, TapedBatch, duration
 from torchdyn_plan.bench.timing import figures
 from torchdyn_plan.envs.moving_target import MovingTargetEnv
@@ -43,7 +45,10 @@ def bench(
     sizes: Sequence[int] = SIZES,
     steps: int = STEPS,
     threads: int = 0,
-) -> list[dict[str, Any]]:
+    out: str | Path | None = None,
+    progress: bool = True,
+    show: Callable[[Row], object] | None = None,
+) -> list[Row]:
     """A row for MuJoCo alone and one for the loop around it, for each size and each way of driving the robots.
 
     ``share_of_raw`` is MuJoCo's time over the loop's for the same commands; ``max_error`` compares their positions.
@@ -54,17 +59,24 @@ def bench(
         sizes: environments side by side.
         steps: control steps of each measurement.
         threads: of the simulation, 0 for all cores.
+        out: JSON file for the rows, written with each of them.
+        progress: show a progress bar.
+        show: is given each row once it is measured and saved.
 
     Raises:
         InputError: the environment has no ``simulation.batch`` that is a `mujoco.batch.Batch`.
+        OutputError: the file cannot be written.
     """
     from tqdm import tqdm
 
     task = load_task(task)
+    about = {"task": task.name, "sizes": list(sizes), "steps": steps, "threads": threads}
+    record = Record(out, show=show, benchmark="env", **about)
     drivers = _planners(task, planners)
-    rows = []
-    total = len(sizes) * (1 + len(drivers)) * steps
-    with one_thread(), torch.no_grad(), tqdm(total=total, desc="env", unit="step", leave=False) as bar:
+    bar = tqdm(
+        total=len(sizes) * (1 + len(drivers)) * steps, desc="env", unit="step", leave=False, disable=not progress
+    )
+    with one_thread(), torch.no_grad(), bar:
         for size in sizes:
             for what in (RANDOM, *drivers):
                 env, taped = taped_env(task, size, threads)
@@ -73,8 +85,9 @@ def bench(
                 else:
                     loop = play(drivers[what], env, EpisodeLog.empty(10 * size, task, env))
                 raw, taken, error = _take_turns(loop, taped, steps, bar.update)
-                rows += _rows(what, env, raw, taken, error)
-    return rows
+                for row in _rows(what, env, raw, taken, error):
+                    record.add(row)
+    return record.end()
 
 
 def taped_env(task: Task, size: int, threads: int = 0) -> tuple[MovingTargetEnv, TapedBatch]:
@@ -132,9 +145,7 @@ def _take_turns(
     return raw, taken, error
 
 
-def _rows(
-    what: str, env: MovingTargetEnv, raw: Sequence[float], taken: Sequence[float], error: float
-) -> list[dict[str, Any]]:
+def _rows(what: str, env: MovingTargetEnv, raw: Sequence[float], taken: Sequence[float], error: float) -> list[Row]:
     simulation: Any = getattr(env, "simulation")  # noqa: B009
     rows = []
     name = type(env).__name__ if what == RANDOM else "evaluation loop"

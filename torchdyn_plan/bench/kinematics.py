@@ -6,6 +6,7 @@ import copy
 import math
 from collections.abc import Callable, Iterator, Sequence
 from functools import partial
+from pathlib import Path
 from typing import Any
 
 import torch
@@ -15,6 +16,7 @@ from torch import Tensor
 from torchdyn_plan import keys
 from torchdyn_plan.bench.damped_steps import DampedSteps
 from torchdyn_plan.bench.observations import pursued
+from torchdyn_plan.bench.record import Record, Row
 from torchdyn_plan.bench.rivals import DAMPING, Eaik, Mink, Pinocchio, PytorchKinematics, installed
 from torchdyn_plan.bench.timing import figures, sample
 from torchdyn_plan.errors import CompileError
@@ -33,8 +35,6 @@ CHECKED = 64
 POSE, STEPS, SOLUTION = "pose and Jacobian", "five damped steps", "solution"
 PLANNER, CALL = "IKPlanner step", "IKPlanner call"
 
-Row = dict[str, Any]
-
 
 def bench(
     task: Task | str = DEFAULT,
@@ -43,6 +43,9 @@ def bench(
     seconds: float = 0.5,
     compiled: bool = True,
     rivals: bool = True,
+    out: str | Path | None = None,
+    progress: bool = True,
+    show: Callable[[Row], object] | None = None,
 ) -> list[Row]:
     """A row for each device, batch, problem and implementation: its time, and how wrong its result is.
 
@@ -55,31 +58,40 @@ def bench(
         seconds: time spent on each figure.
         compiled: measure compiled forms too, where there is a compiler.
         rivals: measure the other libraries that are installed.
+        out: JSON file for the rows, written with each of them.
+        progress: show a progress bar.
+        show: is given each row once it is measured and saved.
+
+    Raises:
+        OutputError: the file cannot be written.
     """
     from tqdm import tqdm
 
-    static = load_task(task).static_planner()
+    task = load_task(task)
+    about = {"task": task.name, "batches": list(batches), "seconds": seconds, "compiled": compiled}
+    record = Record(out, show=show, benchmark="kinematics", **about)
+    static = task.static_planner()
     planner = static if isinstance(static, IKPlanner) else None
-    rows: list[Row] = []
     others = installed((PytorchKinematics, Pinocchio, Mink)) if rivals else []
     devices = ["cpu", *(["cuda"] if torch.cuda.is_available() else [])]
-    with one_thread(), torch.no_grad(), tqdm(desc="kinematics", unit="figure", leave=False) as bar:
+    bar = tqdm(desc="kinematics", unit="figure", leave=False, disable=not progress)
+    with one_thread(), torch.no_grad(), bar:
         for device in devices:
             own = _Own(device, planner, compiled=compiled)
             for batch in batches:
                 place = {"batch": batch, "device": device}
                 measured = [*_own_rows(own, batch)]
                 if planner is not None:
-                    measured += _planner_rows(own, planner, pursued(load_task(task), batch).to(device))
+                    measured += _planner_rows(own, planner, pursued(task, batch).to(device))
                 if device == "cpu":
                     measured += _rival_rows(others, batch)
                 for one in measured:
-                    rows.append(_row(*one, place, seconds))
+                    record.add(_row(*one, place, seconds))
                     bar.update()
         for one in _solutions(rivals=rivals):
-            rows.append(_row(*one, {"batch": SOLVED_AT_ONCE, "device": "cpu"}, seconds))
+            record.add(_row(*one, {"batch": SOLVED_AT_ONCE, "device": "cpu"}, seconds))
             bar.update()
-    return rows
+    return record.end()
 
 
 plot = plot_bench

@@ -2,176 +2,231 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
-from dataclasses import replace
+from collections.abc import Callable, Generator, Iterator, Mapping, Sequence
+from contextlib import ExitStack, closing, contextmanager
 from functools import partial
-from typing import Any, NamedTuple
+from pathlib import Path
+from typing import Any
 
 import torch
-from torch import Tensor
+from torch import Tensor, nn
 
-from torchdyn_plan import keys
+from torchdyn_plan.bench.chosen import Choice, Chosen, Source
 from torchdyn_plan.bench.observations import Moments, moments
-from torchdyn_plan.bench.replan_parts import Part, Parts, in_blocks, networks, replans, searches, static_steps, steps
+from torchdyn_plan.bench.record import Record, Row
+from torchdyn_plan.bench.replan_forms import COMPILED, Form, make_forms
+from torchdyn_plan.bench.replan_parts import in_blocks
 from torchdyn_plan.bench.timing import figures, sample
+from torchdyn_plan.checks import check_choice, check_device, check_number
 from torchdyn_plan.errors import InputError
-from torchdyn_plan.planners import DynamicPlanner, ExactSearch
-from torchdyn_plan.tasks import DEFAULT, Task, load_task
-from torchdyn_plan.threads import one_thread
+from torchdyn_plan.evaluation.episodes import Planner
+from torchdyn_plan.tasks import Task, load_task
+from torchdyn_plan.threads import torch_threads
+from torchdyn_plan.versions import usable_cores
 
-BATCHES = (1, 16, 256, 1024, 4096, 16384)
-"""Rows that plan at once."""
+BATCHES = (1, 1024)
+"""Rows that plan at once, if nobody says how many."""
+SECONDS = 0.2
+"""Time spent on each figure, if nobody says how long [s]."""
 BLOCK = 1024
 """Rows that are worked on at a time on a processor, if there are more."""
 SINGLES = 16
 """Rows of a batch that are compared with the same rows computed one by one."""
-COARSE = 4
-"""Of an exact search that is also timed from coarse to fine."""
-COMPILED: dict[str, dict[str, Any]] = {"cpu": {"options": {"cpp_wrapper": True}}, "cuda": {"mode": "reduce-overhead"}}
-"""How `torch.compile` is asked for little work around the kernels: calls from C++, or CUDA graphs."""
-TRAINED, INFERENCE = "torchdyn_plan", "torchdyn_plan, for inference"
-"""Implementations: the networks as they are trained, and their copies for inference."""
-
-
-class Form(NamedTuple):
-    """One thing that is timed."""
-
-    about: dict[str, Any]
-    """What a row of figures says of it."""
-    planner: str
-    """Name of the planner whose observations it reads."""
-    part: Part
-    """What is timed."""
-    reference: Callable[..., Sequence[Tensor]]
-    """What its results are compared with, row by row."""
+NO_FIGURES = ("median_us", "p95_us", "p99_us", "per_item_us", "per_second", "max_error")
+"""Entries that are None in a row that could not be measured."""
 
 
 def bench(
-    task: Task | str = DEFAULT,
+    planner: Choice | None = None,
     *,
-    planners: Mapping[str, DynamicPlanner] | Sequence[str] | None = None,
+    task: Task | str | None = None,
+    static: str | None = None,
+    weights: str | Path | None = None,
     batches: Sequence[int] = BATCHES,
-    seconds: float = 0.4,
-    compiled: bool = True,
-) -> list[dict[str, Any]]:
-    """A row for each device, batch, part and implementation.
+    seconds: float = SECONDS,
+    threads: int = 1,
+    device: torch.device | str = "cpu",
+    compiled: bool = False,
+    out: str | Path | None = None,
+    progress: bool = True,
+    show: Callable[[Row], object] | None = None,
+) -> list[Row]:
+    """A row for each batch, part and implementation.
 
     A row has the latency's median, 95th and 99th percentile, the throughput ``per_second``, and ``max_error``: the
     greatest difference from the same rows one by one, eager and with the networks as they are trained. A meeting may
-    differ much where two are as good: rounding decides. Networks and the static planner are those of the first planner.
+    differ much where two are as good: rounding decides. On a processor more than `BLOCK` rows are worked on in blocks.
+
+    Timed is what a planner itself does: its `DynamicPlanner.replan`, with its own search and models, and its steps. Of
+    a planner that is none, a baseline or one for static goals, the step alone is timed. Models and static planners that
+    several planners share are timed once; rows of parts of others than the first planner have their planner's name.
+    What cannot be measured has its ``error`` in its row, and no figures: a search in Python that does not compile.
 
     Args:
-        task: what the planners see is taken from its environment.
-        planners: by name, or names of the task's own; for None its default ones that plan on what is seen.
+        planner: a planner, planners by name, or names: of the task's planners, of one that ships, of a folder with a
+            planner, or ``package.module:NAME``. None for the task's default ones that plan on what is seen.
+        task: what the planners see is taken from its environment; for None from that of the task to whose scene a
+            planner belongs, or the default one.
+        static: name of the static planner on which the task's planners are built; its default one for None.
+        weights: folder of the networks of the task's planners, as ``train`` leaves it; those that ship for None.
         batches: rows that plan at once.
         seconds: time spent on each figure.
+        threads: of torch, 0 for all cores; afterwards it has as many as before.
+        device: where planners run, ``cpu`` or ``cuda``; afterwards they are where they were.
         compiled: also measure re-plans and networks compiled; each takes up to three compilations of a minute or less.
+        out: JSON file for the rows, written with each of them: a run that is killed leaves those that it has. Timings
+            are never continued: another run begins anew.
+        progress: show a progress bar.
+        show: is given each row once it is measured and saved.
 
     Raises:
-        InputError: a planner is no `DynamicPlanner`, or there is none.
+        InputError: there is no such planner or device, a number is out of range, or a planner cannot act in the task.
+        WeightsError: weights are missing or damaged.
+        OutputError: the file cannot be written.
     """
+    _check(batches, seconds, threads, device)
+    threads, device = threads or usable_cores(), str(torch.device(device))
+    known = None if task is None else load_task(task)
+    record = Record(
+        out,
+        show=show,
+        benchmark="replan",
+        task=None if known is None else known.name,
+        static=static,
+        weights=None if weights is None else str(weights),
+        batches=list(batches),
+        seconds=seconds,
+        threads=threads,
+        device=device,
+        compiled=compiled,
+    )
+    chosen = Source(task=known, static=static, weights=weights).choose(planner)
+    record.about["config"]["planners"] = {name: one.task.name for name, one in chosen.items()}
+    with ExitStack() as stack:
+        stack.enter_context(torch_threads(threads))
+        stack.enter_context(torch.no_grad())
+        if compiled:
+            # The forms share code, and count together.
+            stack.enter_context(torch._dynamo.config.patch(recompile_limit=64))
+        rows = _measure(chosen, batches, seconds, device, compiled=compiled, progress=progress)
+        # Whatever happens to a row, planners go back to where they were.
+        for row in stack.enter_context(closing(rows)):
+            record.add(row)
+    return record.end()
+
+
+def _check(batches: Sequence[int], seconds: float, threads: int, device: torch.device | str) -> None:
+    """Raise `InputError` for what is out of range."""
+    if not batches:
+        raise InputError("batches must name one number of rows at least, got none")
+    for batch in batches:
+        check_number("batches", batch, minimum=1, integer=True)
+    check_number("seconds", seconds, minimum=0.0)
+    check_number("threads", threads, minimum=0, integer=True)
+    check_device(device)
+    check_choice("kind of device to measure on", torch.device(device).type, COMPILED)
+
+
+def _measure(
+    chosen: Mapping[str, Chosen],
+    batches: Sequence[int],
+    seconds: float,
+    device: str,
+    *,
+    compiled: bool,
+    progress: bool,
+) -> Generator[Row]:
+    """The rows, one after the other."""
     from tqdm import tqdm
 
-    task = load_task(task)
-    made = _planners(task, planners)
-    devices = ["cpu", *(["cuda"] if torch.cuda.is_available() else [])]
-    rows = []
-    several = torch._dynamo.config.patch(recompile_limit=64)  # The forms share code, and count together.
-    with one_thread(), torch.no_grad(), several, tqdm(desc="re-plan", unit="figure", leave=False) as bar:
-        whole = {name: moments(task, planner, name) for name, planner in made.items()}
-        for device in devices:
-            forms = _forms(
-                {name: planner.to(device) for name, planner in made.items()}, whole, device, compiled=compiled
-            )
-            for batch in batches:
-                seen = {name: one.repeated(batch).to(device) for name, one in whole.items()}
-                for form in forms:
-                    bar.set_postfix_str(f"{device}, batch {batch}, {form.about['what']}")
-                    rows.append(_row(form, form.part.inputs(seen[form.planner]), batch, device, seconds))
-                    bar.update()
-    for planner in made.values():
-        planner.to("cpu")
-    return rows
+    planners = {name: one.planner for name, one in chosen.items()}
+    with ExitStack() as stack:
+        bar = stack.enter_context(tqdm(desc="re-plan", unit="figure", leave=False, disable=not progress))
+        for planner in planners.values():
+            stack.enter_context(_stays(planner))
+        whole: dict[str, Moments] = {}
+        for name, (planner, task) in chosen.items():
+            bar.set_postfix_str(f"{name} in episodes of {task.name}")
+            _move(planner, "cpu")
+            whole[name] = moments(task, planner, name)
+            _move(planner, device)
+        forms = make_forms(planners, whole, device, compiled=compiled)
+        bar.reset(total=len(forms) * len(batches))
+        failed: dict[int, str] = {}
+        for batch in batches:
+            seen = {name: one.repeated(batch).to(device) for name, one in whole.items()}
+            for number, form in enumerate(forms):
+                compiling = ", compiled" if form.about["compiled"] else ""
+                bar.set_postfix_str(f"{device}, batch {batch}, {form.about['what']}{compiling}")
+                known = failed.get(number)
+                row = _row(form, seen[form.planner], known, batch=batch, device=device, seconds=seconds)
+                if "error" in row and form.about["compiled"]:
+                    failed[number] = row["error"]
+                yield row
+                bar.update()
 
 
-def _planners(task: Task, planners: Mapping[str, Any] | Sequence[str] | None) -> dict[str, DynamicPlanner]:
-    """The planners that are timed, by name."""
-    if planners is None:
-        return _default_planners(task)
-    if isinstance(planners, str):
-        raise InputError(f"planners must be a list of names or a mapping of planners, got the string {planners!r}")
-    found = dict(planners) if isinstance(planners, Mapping) else {name: task.planner(name) for name in planners}
-    if not found:
-        raise InputError("planners must name one planner at least, got none")
-    for name, planner in found.items():
-        if not isinstance(planner, DynamicPlanner):
-            raise InputError(f"only a DynamicPlanner plans again and again, but {name!r} is {type(planner).__name__}")
-    return found
+@contextmanager
+def _stays(planner: Planner) -> Iterator[None]:
+    """Afterwards ``planner`` is on the device on which it was."""
+    tensors = [*planner.parameters(), *planner.buffers()] if isinstance(planner, nn.Module) else []
+    try:
+        yield
+    finally:
+        if tensors:
+            _move(planner, tensors[0].device)
 
 
-def _default_planners(task: Task) -> dict[str, DynamicPlanner]:
-    """The task's default planners that plan on what is seen, and exact searches from coarse to fine."""
-    found = {}
-    for name in task.default_planners:
-        planner = task.planner(name)
-        if not isinstance(planner, DynamicPlanner) or keys.TARGET_FUTURE in planner.in_keys:
-            continue
-        found[name] = planner
-        search = planner.search
-        if isinstance(search, ExactSearch) and search.coarse == 1 and search.probability_weight == 0.0:
-            found[f"{name}, coarse to fine"] = planner.with_parts(search=replace(search, coarse=COARSE))
-    if not found:
-        raise InputError(f"no default planner of {task.name} plans again and again: name one")
-    return found
+def _move(planner: Planner, device: torch.device | str) -> None:
+    """Bring ``planner`` to ``device``, if it is a module."""
+    if isinstance(planner, nn.Module):
+        planner.to(device)
 
 
-def _forms(
-    planners: Mapping[str, DynamicPlanner], seen: Mapping[str, Moments], device: str, *, compiled: bool
-) -> list[Form]:
-    """Everything that is timed on ``device``."""
-    plain = _planning(planners)
-    light = _planning({name: planner.for_inference() for name, planner in planners.items()})
-    alone = {name: searches(name, planner) | steps(name, planner, seen[name]) for name, planner in planners.items()}
-    first = next(iter(planners))
-    alone[first] |= static_steps(planners[first].static)
-    forms: list[Form] = []
-
-    def add(group: Mapping[str, Parts], implementation: str, change: Callable[..., Any] | None = None) -> None:
-        for name, parts in group.items():
-            for what, part in parts.items():
-                about = {"what": what, "implementation": implementation, "compiled": change is not None}
-                reference = plain[name].get(what, part).call
-                timed = part if change is None else part._replace(call=change(part.call))
-                forms.append(Form(about, name, timed, reference))
-
-    add(plain, TRAINED)
-    add(alone, TRAINED)
-    add(light, INFERENCE)
-    if compiled:
-        add(light, INFERENCE, partial(torch.compile, fullgraph=True, **COMPILED[device]))
-    return forms
-
-
-def _planning(planners: Mapping[str, DynamicPlanner]) -> dict[str, Parts]:
-    """What makes plans: all re-plans, and the networks of the first planner."""
-    found = {name: replans(name, planner) for name, planner in planners.items()}
-    first = next(iter(planners))
-    return found | {first: networks(planners[first]) | found[first]}
-
-
-def _row(form: Form, inputs: Sequence[Any], batch: int, device: str, seconds: float) -> dict[str, Any]:
-    timed = partial(in_blocks, form.part.call, BLOCK) if device == "cpu" else form.part.call
-    found = figures(sample(lambda: timed(*inputs), device=device, seconds=seconds), batch)
+def _row(form: Form, seen: Moments, error: str | None, *, batch: int, device: str, seconds: float) -> Row:
+    """Figures of one form; none, but the ``error`` that is known or comes up, where it cannot be measured."""
     place = {"batch": batch, "threads": torch.get_num_threads(), "device": device}
-    error = max_error(timed, form.reference, inputs)
-    return form.about | place | found | {"per_second": round(1e6 / found["per_item_us"]), "max_error": error}
+    if error is None:
+        try:
+            return form.about | place | _figures(form, seen, batch=batch, device=device, seconds=seconds)
+        except Exception as raised:
+            lines = str(raised).splitlines() or [""]
+            error = lines[0] if isinstance(raised, InputError) else f"{type(raised).__name__}: {lines[0]}"
+    return form.about | place | dict.fromkeys(NO_FIGURES) | {"error": error}
+
+
+def _figures(form: Form, seen: Moments, *, batch: int, device: str, seconds: float) -> Row:
+    inputs, before = form.part.inputs(seen), form.part.before
+    timed = partial(in_blocks, form.part.call, BLOCK) if device == "cpu" else form.part.call
+    found = figures(sample(lambda: timed(*inputs), device=device, seconds=seconds, before=before), batch)
+    error = max_error(timed, form.reference, inputs, before=before)
+    if before is not None:
+        before()
+    return found | {"per_second": round(1e6 / found["per_item_us"]), "max_error": error}
 
 
 def max_error(
-    call: Callable[..., Sequence[Tensor]], reference: Callable[..., Sequence[Tensor]], inputs: Sequence[Any]
+    call: Callable[..., Sequence[Tensor]],
+    reference: Callable[..., Sequence[Tensor]],
+    inputs: Sequence[Any],
+    *,
+    before: Callable[[], object] | None = None,
 ) -> float:
-    """Greatest difference between the first rows of a batch and what ``reference`` makes of them one by one."""
-    count = min(SINGLES, len(inputs[0]))
-    singles = [reference(*(value[row : row + 1] for value in inputs)) for row in range(count)]
+    """Greatest difference between the first rows of a batch and what ``reference`` makes of them one by one.
+
+    ``before`` is called before each call.
+    """
+    prepare = before or (lambda: None)
+    singles: list[Sequence[Tensor]] = []
+    for row in range(min(SINGLES, len(inputs[0]))):
+        prepare()
+        singles.append(reference(*(value[row : row + 1] for value in inputs)))
+    prepare()
     pairs = zip(call(*inputs), map(torch.cat, zip(*singles, strict=True)), strict=True)
-    return max(float((whole[: len(single)].double() - single.double()).abs().max()) for whole, single in pairs)
+    return max(_difference(whole[: len(single)].double(), single.double()) for whole, single in pairs)
+
+
+def _difference(one: Tensor, other: Tensor) -> float:
+    """Greatest difference: 0 between equal values, infinite ones and NaNs too, and infinite where one alone is so."""
+    same = (one == other) | (one.isnan() & other.isnan())
+    return float((one - other).abs().nan_to_num(torch.inf, torch.inf).masked_fill(same, 0.0).max())

@@ -8,7 +8,14 @@ from collections.abc import Callable, Sequence
 import torch
 
 
-def sample(function: Callable[[], object], *, device: str = "cpu", seconds: float = 0.5, least: int = 3) -> list[float]:
+def sample(
+    function: Callable[[], object],
+    *,
+    device: str = "cpu",
+    seconds: float = 0.5,
+    least: int = 3,
+    before: Callable[[], object] | None = None,
+) -> list[float]:
     """Durations [s] of calls of ``function``, after one that is not counted.
 
     Args:
@@ -16,13 +23,17 @@ def sample(function: Callable[[], object], *, device: str = "cpu", seconds: floa
         device: where it computes; a call ends when the device is done.
         seconds: time after which no further call is made.
         least: calls that are made in any case.
+        before: called before each call, and not timed.
     """
     wait = torch.cuda.synchronize if device.startswith("cuda") else _nothing
+    prepare = before or _nothing
     durations: list[float] = []
+    prepare()
     function()
     wait()
     deadline = time.perf_counter() + seconds
     while len(durations) < least or time.perf_counter() < deadline:
+        prepare()
         started = time.perf_counter()
         function()
         wait()

@@ -38,7 +38,7 @@ def _run(words: Sequence[str]) -> None:
     except ImportError as error:
         raise TorchdynPlanError("the command line needs its extra: pip install 'torchdyn-plan[cli]'") from error
     from torchdyn_plan.cli import commands, forms
-    from torchdyn_plan.cli.arguments import TrainArguments
+    from torchdyn_plan.cli.arguments import BenchArguments, TrainArguments
     from torchdyn_plan.tasks import load_task
 
     named, others = forms.task_of(words)
@@ -50,9 +50,26 @@ def _run(words: Sequence[str]) -> None:
         parsed: Any = tyro.extras.subcommand_cli_from_dict(networks, **about)
         commands.train(task, network, parsed)
         return
-    choices: dict[str, Any] = {**forms.command_forms(task, named), "train": TrainArguments}
+    if others[:1] == ["bench"]:
+        _check_benchmark(others[1:])
+        about = {"prog": f"{PROGRAM} bench", "description": str(BenchArguments.__doc__), "args": others[1:]}
+        parsed = tyro.extras.subcommand_cli_from_dict(forms.bench_forms(task, named), **about)
+        # Planners know the tasks that they belong to, unless another one is asked for.
+        commands.run(task if len(others) < len(words) else None, parsed)
+        return
+    choices: dict[str, Any] = {**forms.command_forms(task, named), "bench": BenchArguments, "train": TrainArguments}
     about = {"prog": PROGRAM, "description": "Planners for static targets, made to meet moving ones.", "args": others}
     commands.run(task, tyro.extras.subcommand_cli_from_dict(choices, **about))
+
+
+def _check_benchmark(words: Sequence[str]) -> None:
+    """Raise `InputError` if ``words`` begin with the name of a benchmark that there is not."""
+    from torchdyn_plan.cli.arguments import BENCHMARKS
+
+    if words and not words[0].startswith("-") and words[0] not in BENCHMARKS:
+        from torchdyn_plan.checks import check_choice
+
+        check_choice("benchmark", words[0], BENCHMARKS)
 
 
 def _network(task: str, networks: Iterable[str], words: Sequence[str]) -> str:

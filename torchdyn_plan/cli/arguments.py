@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, ClassVar
 
 from torchdyn_plan.tasks import DEFAULT
 
@@ -17,7 +17,7 @@ BENCHMARKS = {
     "env": "torchdyn_plan.bench.env",
     "kinematics": "torchdyn_plan.bench.kinematics",
 }
-"""Name of each benchmark, and the module whose ``bench()`` returns its rows and whose ``plot``, if any, draws them."""
+"""Name of each benchmark, and the module whose ``bench()`` measures and whose ``plot``, if any, draws the rows."""
 
 DATA = Path("runs/data")
 """Folder of collected data, if no other is named."""
@@ -141,10 +141,48 @@ class PolicyArguments(TrainArguments):
 
 @dataclass(frozen=True, kw_only=True)
 class BenchArguments(Arguments):
-    """Measure speed on this machine."""
+    """Measure speed on this machine: of a plan, of the simulation, or of kinematics."""
 
-    name: str
+    benchmark: ClassVar[str]
+
     out: Path | None = None
-    """JSON file for the figures; a plot, where there is one, is put beside it."""
+    """JSON file for the figures, written with each: a run that is killed leaves those it has; another begins anew."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class ReplanArguments(BenchArguments):
+    """Time planners: their plans, the parts of these, and their steps."""
+
+    benchmark = "replan"
+
+    planner: tuple[str, ...] = ()
+    static: str = ""
+    weights: Path | None = None
+    """Folder of the networks of the task's planners, as train leaves it; those that ship when not given."""
+    batches: tuple[int, ...] = (1, 1024)
+    """Rows that plan at once."""
+    seconds: float = 0.2
+    """Time spent on each figure [s]."""
+    threads: int = 1
+    """Threads of torch, 0 for all cores."""
+    device: str = "cpu"
+    """Where the planners run: cpu, cuda, cuda:1, …"""
+    compiled: bool = False
+    """Measure compiled plans and networks too: each takes up to a minute or two to compile."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class EnvArguments(BenchArguments):
+    """Time the simulation: how much of MuJoCo's rate is left with the environment and a planner in the loop."""
+
+    benchmark = "env"
+
+
+@dataclass(frozen=True, kw_only=True)
+class KinematicsArguments(BenchArguments):
+    """Time kinematics beside other libraries'; a plot is put beside the figures."""
+
+    benchmark = "kinematics"
+
     compiled: bool = True
-    """Measure compiled forms too, where there are any: they take minutes to compile."""
+    """Measure compiled forms too: they take minutes to compile."""

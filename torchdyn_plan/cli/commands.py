@@ -3,10 +3,9 @@
 from __future__ import annotations
 
 import importlib
-import inspect
-from collections.abc import Callable
-from dataclasses import asdict
-from pathlib import Path
+import sys
+from collections.abc import Callable, Mapping
+from dataclasses import asdict, fields
 from typing import TYPE_CHECKING, Any
 
 from torchdyn_plan.cli.arguments import (
@@ -19,18 +18,19 @@ from torchdyn_plan.cli.arguments import (
     EvaluateArguments,
     FitArguments,
     PolicyArguments,
+    ReplanArguments,
     SweepArguments,
     TrainArguments,
 )
-from torchdyn_plan.errors import InputError, OutputError
+from torchdyn_plan.errors import InputError
 from torchdyn_plan.tasks import Task
 
 if TYPE_CHECKING:
     from torchdyn_plan.planners import Delivery
 
 
-def run(task: Task, arguments: Arguments) -> None:
-    """Run the command that takes these arguments."""
+def run(task: Task | None, arguments: Arguments) -> None:
+    """Run the command that takes these arguments; benchmarks may be given no task."""
     command = next(function for form, function in COMMANDS.items() if isinstance(arguments, form))
     command(task, arguments)
 
@@ -114,44 +114,38 @@ def train(task: Task, network: str, arguments: TrainArguments) -> None:
     )
 
 
-def bench(task: Task, arguments: BenchArguments) -> None:
-    """Measure, write the figures and print them."""
-    from torchdyn_plan.checks import check_choice
-    from torchdyn_plan.files import write_json
-    from torchdyn_plan.versions import library_versions, machine
-
-    check_choice("benchmark", arguments.name, BENCHMARKS)
-    _check_file(arguments.out)
-    benchmark = importlib.import_module(BENCHMARKS[arguments.name])
-    takes = inspect.signature(benchmark.bench).parameters
-    given = {"task": task, "compiled": arguments.compiled}
-    rows = benchmark.bench(**{name: value for name, value in given.items() if name in takes})
-    if arguments.out is not None:
-        write_json(arguments.out, {"machine": machine(), "versions": library_versions(), "rows": rows})
-        if hasattr(benchmark, "plot"):
-            benchmark.plot(rows, arguments.out.with_suffix(".png"))
-    for row in rows:
-        print("  ".join(f"{name} {value}" for name, value in row.items()))
+def bench(task: Task | None, arguments: BenchArguments) -> None:
+    """Measure; write and print each figure once it is there."""
+    benchmark = importlib.import_module(BENCHMARKS[arguments.benchmark])
+    own = {one.name: getattr(arguments, one.name) for one in fields(arguments)}
+    if task is not None or isinstance(arguments, ReplanArguments):
+        own["task"] = task
+    if isinstance(arguments, ReplanArguments):
+        own["planner"] = arguments.planner or None
+    rows = benchmark.bench(**own, show=_print_row)
+    if arguments.out is not None and hasattr(benchmark, "plot"):
+        benchmark.plot(rows, arguments.out.with_suffix(".png"))
 
 
-COMMANDS: dict[type[Arguments], Callable[[Task, Any], None]] = {
+def _print_row(row: Mapping[str, Any]) -> None:
+    """A line for a row, above the bar of progress."""
+    from tqdm import tqdm
+
+    with tqdm.external_write_mode(file=sys.stdout):
+        print("  ".join(f"{name} {_short(value)}" for name, value in row.items()), flush=True)
+
+
+def _short(value: Any) -> str:
+    return f"{value:.5g}" if isinstance(value, float) else str(value)
+
+
+COMMANDS: dict[type[Arguments], Callable[[Any, Any], None]] = {
     EvaluateArguments: evaluate,
     SweepArguments: sweep,
     CollectArguments: collect,
     BenchArguments: bench,
 }
 """The arguments of each command but ``train``, and the function that serves it."""
-
-
-def _check_file(out: Path | None) -> None:
-    """Raise `OutputError` unless a file can be written at ``out``."""
-    from torchdyn_plan.checks import check_writable_folder
-
-    if out is None:
-        return
-    check_writable_folder(out.parent)
-    if out.is_dir():
-        raise OutputError(f"output file {str(out)!r} is a folder")
 
 
 def _shared(task: Task, arguments: EpisodeArguments) -> dict[str, Any]:

@@ -8,14 +8,15 @@ from collections.abc import Iterable, Sequence
 from typing import Any
 
 from torchdyn_plan.cli.arguments import (
-    BENCHMARKS,
     Arguments,
-    BenchArguments,
     CollectArguments,
+    EnvArguments,
     EpisodeArguments,
     EvaluateArguments,
     FitArguments,
+    KinematicsArguments,
     PolicyArguments,
+    ReplanArguments,
     SweepArguments,
 )
 from torchdyn_plan.errors import InputError
@@ -46,7 +47,7 @@ def task_of(words: Sequence[str]) -> tuple[str, list[str]]:
 
 
 def command_forms(task: Task, named: str) -> dict[str, type[Arguments]]:
-    """The arguments of each command but ``train`` for ``task``, which the words call ``named``."""
+    """The arguments of each command but ``train`` and ``bench`` for ``task``, which the words call ``named``."""
     return {
         "evaluate": _episode_form(EvaluateArguments, task, named),
         "sweep": _episode_form(SweepArguments, task, named, over=_over(task)),
@@ -56,11 +57,23 @@ def command_forms(task: Task, named: str) -> dict[str, type[Arguments]]:
             what=_option(str, "Which data.", choices=("paths", "arrivals"), positional=True),
             static=_static_option(task, "Static planner whose arrivals are measured."),
         ),
-        "bench": _form(
-            BenchArguments,
+    }
+
+
+def bench_forms(task: Task, named: str) -> dict[str, type[Arguments]]:
+    """The arguments of each benchmark on ``task``, which the words call ``named``."""
+    choices = "|".join([*task.planners, *task.static_planners, "TASK-STATIC", "FOLDER", "package.module:NAME"])
+    planner = "A planner that is timed, once for each: by name, of those that ship or in a folder too, or at a place."
+    default = "Those of the task that plan on what is seen when none is given."
+    return {
+        "replan": _form(
+            ReplanArguments,
             task=_task_option(named),
-            name=_option(str, "What to measure.", choices=BENCHMARKS, positional=True),
+            planner=_repeated_option(f"{planner} {default}", choices),
+            static=_static_option(task, "Static planner on which the task's own planners are built."),
         ),
+        "env": _form(EnvArguments, task=_task_option(named)),
+        "kinematics": _form(KinematicsArguments, task=_task_option(named)),
     }
 
 
@@ -129,6 +142,14 @@ def _option(
     if positional:
         marks.append(tyro.conf.Positional)
     return typing.Annotated[(kind, *marks)], dataclasses.field(default=default)
+
+
+def _repeated_option(text: str, shown: str) -> tuple[Any, Any]:
+    """Type and field of an option that may be given several times, a word each."""
+    import tyro
+
+    marks = tyro.conf.UseAppendAction, tyro.conf.arg(help=text, metavar=shown)
+    return typing.Annotated[(tuple[str, ...], *marks)], dataclasses.field(default=())
 
 
 def _group(kind: type[Any]) -> tuple[Any, Any]:

@@ -13,6 +13,7 @@ from torchdyn_plan.planners.maneuver import GoTo, Maneuver
 from torchdyn_plan.planners.observation import Observation
 from torchdyn_plan.planners.plan import Lost, LostBelow, Plan, PlanStatus
 from torchdyn_plan.planners.planner import DynamicPlanner, observe
+from torchdyn_plan.planners.pretrained import shipped_planners
 from torchdyn_plan.planners.protocol import StaticPlanner
 from torchdyn_plan.planners.schedule import EventSchedule, ReplanSchedule, Schedule
 from torchdyn_plan.planners.search import (
@@ -67,5 +68,6 @@ __all__ = [
     "observe",
     "oracle_trajectory",
     "search_corners",
+    "shipped_planners",
     "wait_at_end",
 ]

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 import time
 from collections.abc import Callable
-from concurrent.futures import Executor, Future, ThreadPoolExecutor
+from concurrent.futures import Executor, Future, ThreadPoolExecutor, wait
 from typing import ClassVar, NamedTuple
 
 import torch
@@ -58,6 +58,12 @@ class Background:
     def close(self) -> None:
         """Wait for the thread's last plan and end it."""
         self.executor.shutdown()
+
+    def drop(self) -> None:
+        """Forget the plan under way, once it is made: for a loop that begins anew, or is looked at out of its order."""
+        order, self._order = self._order, None
+        if order is not None:
+            wait([order.made])
 
     def start(self, plan: Plan) -> NoState:
         """Nothing."""

@@ -95,6 +95,11 @@ class PretrainedPlanner:
         return _ready(planner.to(device), parts)
 
 
+def shipped_planners() -> list[str]:
+    """Names of the planners that ship."""
+    return sorted(file.stem.removeprefix("planner-") for file in SHIPPED.glob("planner-*.json"))
+
+
 def _ready(planner: Any, given: Mapping[str, Any]) -> Any:
     """``planner``, to run and not to train, but for its parts that were ``given``: those are left as they are."""
     planner.training = False
@@ -206,10 +211,9 @@ def _find(name_or_folder: str | Path) -> Path:
     for choice in choices:
         if choice.is_file():
             return choice
-    shipped = [file.stem.removeprefix("planner-") for file in SHIPPED.glob("planner-*.json")]
     if Path(name_or_folder).is_dir():
         raise InputError(f"folder {str(name_or_folder)!r} holds no planner: no {FILE}, as save_pretrained writes it")
-    check_choice("planner", str(name_or_folder), shipped)
+    check_choice("planner", str(name_or_folder), shipped_planners())
     raise AssertionError("a planner that ships was not found")
 
 

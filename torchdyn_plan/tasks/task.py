@@ -322,15 +322,24 @@ def load_task(name: str | Task) -> Task:
     raise InputError(f"unknown task {name!r}{hint}; choose from {', '.join(task_names())}, or give package.module:NAME")
 
 
-def _import_task(place: str) -> Task:
-    """The task at ``package.module:NAME``; the working folder is looked at, too."""
+def import_place(place: str, what: str) -> Any:
+    """The object at ``place``, ``package.module:NAME``; the working folder is looked at, too.
+
+    Raises:
+        InputError: it cannot be imported, and is no ``what`` therefore.
+    """
     module, _, attribute = place.partition(":")
     if str(Path.cwd()) not in sys.path and "" not in sys.path:
         sys.path.append(str(Path.cwd()))
     try:
-        found = getattr(importlib.import_module(module), attribute)
+        return getattr(importlib.import_module(module), attribute)
     except (ImportError, AttributeError, ValueError) as error:
-        raise InputError(f"no task at {place!r}: {error}") from error
+        raise InputError(f"no {what} at {place!r}: {error}") from error
+
+
+def _import_task(place: str) -> Task:
+    """The task at ``package.module:NAME``."""
+    found = import_place(place, "task")
     if not isinstance(found, Task):
         raise InputError(f"{place!r} is no Task, but {type(found).__name__}")
     return found

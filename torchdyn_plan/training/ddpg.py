@@ -15,12 +15,12 @@ from torchrl.modules import AdditiveGaussianModule, ValueOperator
 from torchrl.objectives import SoftUpdate
 
 from torchdyn_plan import keys
+from torchdyn_plan.checks import check_device
 from torchdyn_plan.errors import TrainingError
 from torchdyn_plan.nets.policy import Actor, Critic
 from torchdyn_plan.training.checkpoint import group
 from torchdyn_plan.training.exploration import BoundedTD0, PenalisedDDPGLoss, RandomActionModule
 from torchdyn_plan.training.goal_task import SEEN, DDPGRecipe, GoalReplay, GoalTask
-from torchdyn_plan.training.optimise import check_device
 
 
 class DDPG:
@@ -95,7 +95,7 @@ class DDPG:
         if not episodes["next", "done"][..., -1, :].all():
             raise TrainingError(f"episodes must end after {self.task.length} actions, and some did not")
         read = [*SEEN, keys.ACTION, *(("next", key) for key in (*SEEN, keys.ACHIEVED_GOAL, "reward", "done"))]
-        self.replay.extend_episodes(episodes.select(*read, ("next", "terminated"), *self.task.stored))
+        self.replay.extend(episodes.select(*read, ("next", "terminated"), *self.task.stored))
         return {"reward": float(episodes["next", "reward"].mean())}
 
     def standardise(self) -> None:

@@ -5,7 +5,7 @@ from __future__ import annotations
 from typing import Any
 
 import torch
-from tensordict import TensorDict, TensorDictBase
+from tensordict import TensorDict
 from torch import Tensor
 from torchrl.data import LazyTensorStorage, ReplayBuffer
 
@@ -25,11 +25,26 @@ class EpisodeReplayBuffer(ReplayBuffer):
     length: int
     """Transitions in an episode."""
 
-    def extend_episodes(self, episodes: TensorDictBase) -> None:
-        """Add whole ``episodes``, batch ``(*N, length)``."""
-        if episodes.batch_size[-1] != self.length:
-            raise InputError(f"episodes must have {self.length} transitions, got {episodes.batch_size[-1]}")
-        self.extend(episodes.reshape(-1))
+    def extend(self, data: Any, **settings: Any) -> Any:
+        """Add whole episodes, batch ``(*N, length)``, or ``(N * length,)`` one after the other.
+
+        Raises:
+            InputError: the batch is not so long, or an episode does not end where it should.
+        """
+        batch = tuple(data.batch_size)
+        if len(batch) > 1 and batch[-1] != self.length:
+            raise InputError(f"episodes must have {self.length} transitions, got a batch of {batch}")
+        if not batch or batch[-1] % self.length:
+            raise InputError(f"transitions must come as whole episodes of {self.length}, got a batch of {batch}")
+        rows = data.reshape(-1)
+        done = rows.get(("next", "done"), None)
+        if done is not None and not _ends_each(done.reshape(-1, self.length)):
+            raise InputError(f"transitions must come as whole episodes of {self.length}, got some that end elsewhere")
+        return super().extend(rows, **settings)
+
+    def add(self, data: Any) -> int:
+        """Refused: a single transition is no whole episode."""
+        raise InputError(f"transitions must come as whole episodes of {self.length}, got one: use extend")
 
     def tensors(self) -> dict[str, Tensor]:
         """What is stored, by flat names, in the order of storage."""
@@ -42,7 +57,7 @@ class EpisodeReplayBuffer(ReplayBuffer):
         entries = TensorDict({}, batch_size=[count])
         for name, value in tensors.items():
             entries.set(tuple(name.split(".")), value)
-        self.extend(entries)
+        super().extend(entries)
         writer: Any = self._writer
         writer._cursor = cursor
 
@@ -51,3 +66,8 @@ class EpisodeReplayBuffer(ReplayBuffer):
         """Where the next episode goes."""
         writer: Any = self._writer
         return int(writer._cursor)
+
+
+def _ends_each(done: Tensor) -> bool:
+    """Whether ``done`` (N, T) is true at the end of every row, and nowhere else."""
+    return bool(done[:, -1].all()) and not bool(done[:, :-1].any())

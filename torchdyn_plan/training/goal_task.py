@@ -29,8 +29,8 @@ class GoalReplay(Protocol):
         """Where the next episode goes."""
         ...
 
-    def extend_episodes(self, episodes: TensorDictBase) -> None:
-        """Add whole ``episodes``, batch ``(N, length)``."""
+    def extend(self, data: Any, **settings: Any) -> Any:
+        """Add whole episodes, batch ``(N, length)``."""
         ...
 
     def sample(self) -> Any:

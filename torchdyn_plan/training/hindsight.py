@@ -17,7 +17,8 @@ from torchdyn_plan.training.episode_replay import EpisodeReplayBuffer, episode_s
 NEXT_ACHIEVED = ("next", keys.ACHIEVED_GOAL)
 
 
-class HindsightReplayBuffer(EpisodeReplayBuffer, HERReplayBuffer):
+# TorchRL itself calls the argument of `extend` by two names.
+class HindsightReplayBuffer(EpisodeReplayBuffer, HERReplayBuffer):  # pyright: ignore[reportIncompatibleMethodOverride]
     """TorchRL's `HERReplayBuffer` for episodes of one length, strategy *future*.
 
     Replaces of the upstream: the key of its cache of episode ends (it holds a tensor, and comparing two of them raises

@@ -10,8 +10,8 @@ from typing import Any
 import torch
 from torch import Tensor, nn
 
-from torchdyn_plan.checks import check_number
-from torchdyn_plan.errors import InputError, TrainingError
+from torchdyn_plan.checks import check_device, check_number
+from torchdyn_plan.errors import TrainingError
 from torchdyn_plan.files import write_json
 from torchdyn_plan.training.checkpoint import load_checkpoint, save_checkpoint
 
@@ -62,15 +62,6 @@ class Recipe:
     def is_validated(self, step: int) -> bool:
         """Whether the held-out share is scored after ``step`` steps."""
         return step == self.steps or step % max(1, self.steps // self.validations) == 0
-
-
-def check_device(device: str) -> None:
-    """Raise `InputError` unless ``device`` names a device that is here."""
-    try:
-        torch.empty(1, device=device)
-    except (RuntimeError, AssertionError) as error:
-        reason = str(error).splitlines()[0]
-        raise InputError(f"device {device!r} cannot be used: {reason}") from error
 
 
 def optimise(

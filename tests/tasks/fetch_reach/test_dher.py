@@ -39,7 +39,7 @@ def make_buffer(episodes, **settings):
     generator = torch.Generator().manual_seed(7)
     settings = {"capacity": 10_000, "length": LENGTH, "batch_size": 64, "generator": generator, **settings}
     buffer = DynamicHindsightReplayBuffer(reward, **settings)
-    buffer.extend_episodes(episodes)
+    buffer.extend(episodes)
     return buffer
 
 
@@ -133,7 +133,7 @@ def test_what_is_stored_stays_as_it_was():
 def test_recent_success_is_counted_over_the_latest_episodes():
     buffer = make_buffer(random_episodes(12, 3, successes=(10, 11)), recent=4)
     assert buffer.recent_success == 0.5
-    buffer.extend_episodes(random_episodes(3, 4))
+    buffer.extend(random_episodes(3, 4))
     assert buffer.recent_success == 0.25
 
 
@@ -141,7 +141,7 @@ def test_a_full_buffer_overwrites_whole_episodes_and_matches_anew():
     first, second = random_episodes(6, 0), random_episodes(4, 1)
     buffer = make_buffer(first, capacity=6 * LENGTH + 5)
     assert len(buffer.matches.achieved)
-    buffer.extend_episodes(second)
+    buffer.extend(second)
     kept = torch.cat([second, first[4:]])
     assert all_pairs(buffer.matches) == slow_pairs(kept)
 
@@ -155,7 +155,7 @@ def test_without_a_match_everything_is_plain():
 
 def test_a_buffer_comes_back_as_it_was():
     buffer = make_buffer(random_episodes(6, 0, successes=(5,)), capacity=8 * LENGTH)
-    buffer.extend_episodes(random_episodes(4, 1))
+    buffer.extend(random_episodes(4, 1))
     again = DynamicHindsightReplayBuffer(reward, capacity=8 * LENGTH, length=LENGTH, batch_size=64)
     again.restore(buffer.tensors(), buffer.cursor)
     assert (again.cursor, again.recent_success) == (buffer.cursor, buffer.recent_success)
@@ -171,5 +171,5 @@ def test_bad_settings_are_named(settings, named):
 
 
 def test_episodes_of_another_length_are_named():
-    with pytest.raises(InputError, match="9 transitions, got 4"):
+    with pytest.raises(InputError, match=r"9 transitions, got a batch of \(2, 4\)"):
         make_buffer(random_episodes(2, 0)[:, :4])

@@ -167,6 +167,8 @@ class DynamicReachEnv(MovingTargetEnv):
 
     def _picture(self, row: int, width: int, height: int) -> np.ndarray[Any, Any]:
         if self._painter is None:
+            # The model's own mark of a goal does not move.
+            self.simulation.model.site("target0").rgba[3] = 0.0
             self._painter = Painter(self.simulation.model, lookat=(1.1, 0.75, 0.5), distance=1.8, azimuth=130.0)
         goal = Sphere(tuple(self._goal[row].tolist()), radius=0.02, colour=(0.9, 0.1, 0.1, 1.0))
         return self._painter.picture(self.simulation.qpos[row].numpy(), width, height, [goal])

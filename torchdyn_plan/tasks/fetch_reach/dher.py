@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import torch
 from tensordict import TensorDictBase
@@ -125,13 +125,14 @@ class DynamicHindsightReplayBuffer(EpisodeReplayBuffer):
         self._history = torch.zeros(0, dtype=torch.bool)
         self._matches: Matches | None = None
 
-    def extend_episodes(self, episodes: TensorDictBase) -> None:
-        """Add whole ``episodes``, batch ``(N, length)``, with ``next/reward``, 0 at the goal and negative elsewhere."""
-        super().extend_episodes(episodes)
-        reward: Tensor = episodes.get(("next", "reward"))
-        succeeded = (reward >= 0.0).flatten(1).any(-1)
+    def extend(self, data: Any, **settings: Any) -> Any:
+        """Add whole episodes, as `EpisodeReplayBuffer`, with ``next/reward``, 0 at the goal and negative elsewhere."""
+        added = super().extend(data, **settings)
+        reward: Tensor = data.get(("next", "reward"))
+        succeeded = (reward.reshape(-1, self.length) >= 0.0).any(-1)
         self._history = torch.cat([self._history, succeeded])[-self._recent :]
         self._matches = None
+        return added
 
     @property
     def recent_success(self) -> float:

@@ -1,0 +1,131 @@
+"""Which planners are timed: given, named, found in a folder or a module; and in which task each of them acts."""
+
+from __future__ import annotations
+
+import inspect
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any, NamedTuple
+
+from torchdyn_plan import keys
+from torchdyn_plan.checks import check_choice
+from torchdyn_plan.errors import InputError, TorchdynPlanError
+from torchdyn_plan.evaluation.episodes import Planner
+from torchdyn_plan.planners import DynamicPlanner, ExactSearch, shipped_planners
+from torchdyn_plan.tasks import DEFAULT, Task, import_place, load_task, task_names
+
+COARSE = 4
+"""Of an exact search that is also timed from coarse to fine."""
+ONE = "planner"
+"""Name of a planner that was given without one."""
+
+Choice = Planner | Mapping[str, Planner] | Sequence[str] | str
+"""A planner, planners by name, or names."""
+
+
+class Chosen(NamedTuple):
+    """A planner that is timed."""
+
+    planner: Planner
+    task: Task
+    """In whose environment it acts."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Source:
+    """Where planners come from that are only named."""
+
+    task: Task | None = None
+    """In which all planners act; None for the one to whose scene each belongs."""
+    static: str | None = None
+    """Name of the static planner on which the task's own are built; None for its default one."""
+    weights: str | Path | None = None
+    """Folder of the networks of the task's own; None for those that ship."""
+
+    @property
+    def home(self) -> Task:
+        """The task whose planners are known by their names alone, and in which those act that belong nowhere."""
+        return self.task or load_task(DEFAULT)
+
+    def choose(self, planner: Choice | None) -> dict[str, Chosen]:
+        """The planners by name, the task's default ones for None; raises `InputError`, or `WeightsError`."""
+        if planner is None:
+            return {name: Chosen(one, self.home) for name, one in self._defaults().items()}
+        if isinstance(planner, Task):
+            raise InputError(f"a planner is wanted, got the task {planner.name}: give it as task={planner.name!r}")
+        return {name: Chosen(one, self._task_of(one)) for name, one in self._given(planner).items()}
+
+    def _given(self, planner: Choice) -> dict[str, Planner]:
+        """The planners by name."""
+        if isinstance(planner, str | Path):
+            planner = [str(planner)]
+        if isinstance(planner, Mapping):
+            found = dict(planner)
+        elif isinstance(planner, Sequence):
+            if len(set(map(str, planner))) < len(planner):
+                raise InputError(f"planners must be named once each, got {' '.join(map(str, planner))}")
+            found = {str(name): self._find(name) for name in planner}
+        else:
+            found = {ONE: planner}
+        if not found:
+            raise InputError("name one planner at least, got none")
+        for name, one in found.items():
+            if isinstance(one, type) or not callable(one):
+                kind = f"the class {one.__name__}" if isinstance(one, type) else type(one).__name__
+                raise InputError(f"a planner takes and returns a tensordict, but {name!r} is {kind}")
+        return found
+
+    def _find(self, name: Any) -> Planner:
+        """The planner of that name: the task's, one that ships, in a folder, or at ``package.module:NAME``."""
+        if not isinstance(name, str | Path):
+            raise InputError(f"planners must be names, or a mapping of names to planners, got {type(name).__name__}")
+        name, task = str(name), self.home
+        if name in task.planners:
+            return task.planner(name, self.static, weights=self.weights)
+        if name in task.static_planners:
+            return task.static_planner(name)
+        if not Path(name).is_dir():
+            if ":" in name:
+                return _import_planner(name)
+            check_choice(f"planner of {task.name}", name, {*task.planners, *task.static_planners, *shipped_planners()})
+        return DynamicPlanner.from_pretrained(name)
+
+    def _defaults(self) -> dict[str, Planner]:
+        """The task's default planners that plan on what is seen, and exact searches from coarse to fine."""
+        task, found = self.home, {}
+        for name in task.default_planners:
+            planner = task.planner(name, self.static, weights=self.weights)
+            if not isinstance(planner, DynamicPlanner) or keys.TARGET_FUTURE in planner.in_keys:
+                continue
+            found[name] = planner
+            search = planner.search
+            if isinstance(search, ExactSearch) and search.coarse == 1 and search.probability_weight == 0.0:
+                found[f"{name}, coarse to fine"] = planner.with_parts(search=replace(search, coarse=COARSE))
+        if not found:
+            raise InputError(f"no default planner of {task.name} plans again and again: name one")
+        return found
+
+    def _task_of(self, planner: Planner) -> Task:
+        """The task that was asked for, else the one to whose scene ``planner`` belongs, else the default one."""
+        scene = getattr(planner, "scene", None)
+        if self.task is not None or scene in (None, self.home.digest()):
+            return self.home
+        others = [name for name in task_names() if name != self.home.name]
+        return next((load_task(name) for name in others if _scene_of(name) == scene), self.home)
+
+
+def _import_planner(place: str) -> Planner:
+    """The planner at ``package.module:NAME``, or what the function there makes of nothing."""
+    found = import_place(place, "planner")
+    is_maker = inspect.isfunction(found) and not inspect.signature(found).parameters
+    maker: Callable[[], Any] = found
+    return maker() if is_maker else found
+
+
+def _scene_of(task: str) -> str | None:
+    """Hash of the scene of the task of that name; None where what it needs is not installed."""
+    try:
+        return load_task(task).digest()
+    except (ImportError, TorchdynPlanError):
+        return None

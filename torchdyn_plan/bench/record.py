@@ -1,0 +1,67 @@
+"""Rows of a benchmark as they come: each is in its file before anybody is told of it."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Mapping
+from pathlib import Path
+from typing import Any
+
+from torchdyn_plan.checks import check_writable_folder
+from torchdyn_plan.errors import OutputError
+from torchdyn_plan.files import write_json
+from torchdyn_plan.versions import library_versions, machine
+
+Row = dict[str, Any]
+
+
+class Record:
+    """The rows of one run of a benchmark, and the file that holds them.
+
+    A run that is killed leaves the rows that it has. Timings belong together: another run takes them anew, and its
+    first row takes the place of the old file.
+    """
+
+    def __init__(
+        self, out: str | Path | None = None, *, show: Callable[[Row], object] | None = None, **config: Any
+    ) -> None:
+        """Begin without rows.
+
+        Args:
+            out: JSON file for the rows; None for none.
+            show: is given each row once it is saved.
+            config: what is run, for the file.
+
+        Raises:
+            OutputError: no file can be written at ``out``.
+        """
+        self.rows: list[Row] = []
+        self.out, self.show = None if out is None else Path(out), show
+        self.about = {"config": config}
+        if self.out is not None:
+            check_writable_folder(self.out.parent)
+            if self.out.is_dir():
+                raise OutputError(f"output file {str(out)!r} is a folder")
+            self.about |= {"machine": machine(), "versions": library_versions()}
+
+    def add(self, row: Mapping[str, Any]) -> None:
+        """Save ``row`` and show it."""
+        self.rows.append(dict(row))
+        self._write(complete=False)
+        if self.show is not None:
+            self.show(self.rows[-1])
+
+    def end(self) -> list[Row]:
+        """Say in the file that all rows are there; returns them."""
+        self._write(complete=True)
+        return self.rows
+
+    def _write(self, *, complete: bool) -> None:
+        if self.out is not None:
+            rows = [{name: _json(value) for name, value in row.items()} for row in self.rows]
+            write_json(self.out, self.about | {"complete": complete, "rows": rows})
+
+
+def _json(value: Any) -> Any:
+    """``value`` as JSON has it: None for a number that is not finite."""
+    return None if isinstance(value, float) and not math.isfinite(value) else value
