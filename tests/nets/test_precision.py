@@ -193,3 +193,27 @@ def test_constants_widen_from_what_they_were():
     assert float(module.third) == float(torch.tensor(1.0 / 3.0))
     assert module.count.dtype == torch.int64
     assert module.double().third.dtype == torch.float64
+
+
+@pytest.mark.parametrize("name", ["forecaster", "spread for inference", "arrival", "arrival for inference", "actor"])
+def test_a_compiled_network_is_one_graph_with_and_without_autocast(name):
+    kind = KINDS[name]
+    network, seen = kind.make().requires_grad_(False), kind.inputs(3)
+    # Each case counts its own graphs.
+    torch.compiler.reset()
+    compiled = torch.compile(lambda *rows: kind.call(network, rows), backend="eager", fullgraph=True)
+    expected = kind.call(network, seen)
+    assert_close(compiled(*seen), expected)
+    assert compiled(*convert(seen, torch.float64))[0].dtype == torch.float64
+    with torch.autocast("cpu", dtype=torch.bfloat16):
+        assert_close(compiled(*seen), expected)
+
+
+@pytest.mark.skipif(not torch.cuda.is_available(), reason="needs a GPU")
+@pytest.mark.parametrize("dtype", HALVES)
+def test_autocast_changes_nothing_on_a_gpu(kind, network, dtype):
+    there, seen = copy.deepcopy(network).cuda(), [value.cuda() for value in kind.inputs(5)]
+    expected = kind.call(there, seen)
+    with torch.autocast("cuda", dtype=dtype):
+        found = kind.call(there, seen)
+    assert_close(found, expected)

@@ -104,9 +104,12 @@ class ETANetwork(Pretrained, Precise, ArrivalModel):
         place, stored = network_input("goal", goal, 3, **about), self.head.weight.dtype
         state = torch.addcmul(self.state_shift, seen, self.state_scale)
         target = torch.addcmul(self.goal_shift, self._goal_features(seen, place), self.goal_scale)
-        hidden = (self.state_in(state.to(stored)) + self.goal_in(target.to(stored))).relu_()
+        if state.dtype != stored:
+            state, target = state.to(stored), target.to(stored)
+        hidden = (self.state_in(state) + self.goal_in(target)).relu_()
         rows = self.third(self.second(hidden.view(-1, self.config.hidden)).relu_()).relu_()
-        return self.head(rows).view(*hidden.shape[:-1], self.config.bins + 1).to(goal.dtype)
+        scores = self.head(rows).view(*hidden.shape[:-1], self.config.bins + 1)
+        return scores if scores.dtype == goal.dtype else scores.to(goal.dtype)
 
     def arrival(self, robot_state: Tensor, goal: Tensor, *, estimator: str = "mode") -> Arrival:
         """Arrival time at ``goal (*B, 3)`` from ``robot_state (*B, S)``, batches broadcasting as in `forward`.

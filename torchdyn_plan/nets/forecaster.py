@@ -167,7 +167,7 @@ class Forecaster(Pretrained, Precise, DescribedForecast):
             line = torch.bmm(turn, line)
         swapped = hidden.new_zeros(len(hidden), dtype=torch.bool) if turn is None else turn[:, 0, 0] == 0.0
         path = line.mT.view(*target_history.shape[:-2], config.horizon, 3)
-        return path.to(target_history.dtype), hidden, swapped
+        return path if path.dtype == target_history.dtype else path.to(target_history.dtype), hidden, swapped
 
     def _line(self, history: Tensor) -> tuple[Tensor, Tensor]:
         """Unreflected positions (R, 3, F) after the turned histories (R, H, 3) [m], and the last hidden layer.
@@ -176,12 +176,16 @@ class Forecaster(Pretrained, Precise, DescribedForecast):
         """
         now, step = history[:, -1], history[:, 1:] - history[:, :-1]
         newest, stored = step[:, -1], self.join.weight.dtype
-        features = self._step_features(step).to(stored)
+        features, present = self._step_features(step), self._present_features(now, newest)
+        if features.dtype != stored:
+            features, present = features.to(stored), present.to(stored)
         for layer in (self.embed, *self.convolve):
             features = convolve(features, layer).relu_()
-        joined = torch.cat([features.flatten(1), self._present_features(now, newest).to(stored)], dim=-1)
+        joined = torch.cat([features.flatten(1), present], dim=-1)
         hidden = self.hidden(self.join(joined).relu_()).relu_()
-        departure = self.head(self.mix(hidden)).view(-1, 3, self.config.horizon).to(now.dtype)
+        departure = self.head(self.mix(hidden)).view(-1, 3, self.config.horizon)
+        if departure.dtype != now.dtype:
+            departure = departure.to(now.dtype)
         straight = torch.addcmul(now.unsqueeze(-1), newest.unsqueeze(-1), self.step_factor)
         return torch.addcmul(straight, departure, self.departure_scale), hidden
 

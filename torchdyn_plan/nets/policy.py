@@ -113,19 +113,21 @@ class Actor(Pretrained, nn.Module):
         Raises:
             InputError: a trailing shape or a device is wrong, or an input holds a NaN.
         """
-        like, first = self.features.scale, next(iter(self.body))
         if autocast_is_on():
             return without_autocast(self.forward, robot_state, goal)
-        about: Any = {"like": like, "owner": type(self).__name__, "finite": False}
+        features, body = self.features, self.body
+        about: Any = {"like": features.scale, "owner": type(self).__name__, "finite": False}
         seen = network_input("robot_state", robot_state, self.config.robot_state_size, **about)
-        hidden = self.features(seen, network_input("goal", goal, 3, **about)).to(first.weight.dtype)
+        hidden = features(seen, network_input("goal", goal, 3, **about))
         # Looked at once, where both have come together.
         if not torch.compiler.is_compiling() and not math.isfinite(debug_unwrap(hidden).sum().item()):
             check_finite("robot_state", robot_state)
             check_finite("goal", goal)
-        for layer in self.body:
+        hidden = _as_stored(hidden, body)
+        for layer in body:
             hidden = layer(hidden)
-        return torch.tanh(hidden).to(goal.dtype)
+        action = torch.tanh(hidden)
+        return action if action.dtype == goal.dtype else action.to(goal.dtype)
 
 
 class Critic(nn.Module):
@@ -140,12 +142,19 @@ class Critic(nn.Module):
 
     def forward(self, robot_state: Tensor, goal: Tensor, action: Tensor) -> Tensor:
         """Value ``(*B, 1)``, of the goal's type, of ``action`` (*B, A) for a robot state (*B, S) and a goal (*B, 3)."""
-        like, first = self.features.scale, next(iter(self.body))
         if autocast_is_on():
             return without_autocast(self.forward, robot_state, goal, action)
-        features = self.features(robot_state.to(like.dtype), goal.to(like.dtype))
-        seen = torch.cat([features, action.to(like.dtype)], dim=-1)
-        return self.body(seen.to(first.weight.dtype)).to(goal.dtype)
+        dtype = self.features.scale.dtype
+        features = self.features(robot_state.to(dtype), goal.to(dtype))
+        seen = torch.cat([features, action.to(dtype)], dim=-1)
+        return self.body(_as_stored(seen, self.body)).to(goal.dtype)
+
+
+def _as_stored(features: Tensor, body: nn.Sequential) -> Tensor:
+    """``features`` in the type of the weights of ``body``."""
+    first: Any = next(iter(body))
+    dtype = first.weight.dtype
+    return features if features.dtype == dtype else features.to(dtype)
 
 
 def _perceptron(inputs: int, config: PolicyConfig, outputs: int, *, normalised: bool) -> nn.Sequential:

@@ -73,7 +73,7 @@ class RecordedFuture(ForecastModel):
         self.horizon = horizon
 
     def predict(self, *seen: Tensor) -> Forecast:
-        """Positions at steps t+1 … t+F, ``(*B, F, 3)``, of recordings ``(*B, T, 3)`` [m, world] at steps t ``(*B,)``."""
+        """Positions at steps t+1 … t+F, ``(*B, F, 3)``, of recordings ``(*B, T, 3)`` at steps t (*B,) [m, world]."""
         target_future, step_count = seen
         check_trailing_shape(keys.TARGET_FUTURE, target_future, target_future.shape[-2], 3)
         check_finite(keys.TARGET_FUTURE, target_future)
