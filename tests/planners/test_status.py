@@ -1,5 +1,6 @@
 import pytest
 import torch
+from tensordict import TensorDict
 
 from tests.planners.toy import (
     HISTORY,
@@ -15,6 +16,7 @@ from tests.tasks.trapper.crossing import make_planner as make_waiting_planner
 from tests.tasks.trapper.crossing import world
 from torchdyn_plan.errors import InputError
 from torchdyn_plan.planners import DynamicPlanner, LostBelow, Observation, PlanStatus
+from torchdyn_plan.planners.judging import judge
 from torchdyn_plan.planners.plan import FARTHEST, input_status, usable_path
 
 pytestmark = pytest.mark.filterwarnings(NO_MEMORY)
@@ -217,22 +219,26 @@ def looking(target_pos, *seen):
     return Observation(torch.zeros_like(target_pos), target_pos, target_pos, step_count, seen)
 
 
+def status_of(observation, lost):
+    return input_status(observation, judge(observation, TensorDict({}), [], [])[1].bad_input, lost)
+
+
 def test_input_is_judged_for_any_batch():
     target = torch.zeros(2, 3, 3)
     target[0, 1, 1], target[1, 2, 2], target[1, 0, 2] = NAN, -0.5, -0.2
     seen = torch.zeros(2, 3, 6, 3), torch.zeros(2, 3, dtype=torch.int64)
     seen[0][1, 1, 5, 2] = -INF
     lost = LostBelow(seen_below=-0.3, forecast_below=0.0)
-    codes = input_status(looking(target, *seen), lost)
+    codes = status_of(looking(target, *seen), lost)
     assert codes.tolist() == [[0, PlanStatus.BAD_INPUT, 0], [0, PlanStatus.BAD_INPUT, PlanStatus.TARGET_LOST]]
-    assert input_status(looking(target[0, 1], *(value[0, 1] for value in seen)), lost) == PlanStatus.BAD_INPUT
-    assert input_status(looking(target, *seen), None).tolist() == [[0, PlanStatus.BAD_INPUT, 0]] * 2
+    assert status_of(looking(target[0, 1], *(value[0, 1] for value in seen)), lost) == PlanStatus.BAD_INPUT
+    assert status_of(looking(target, *seen), None).tolist() == [[0, PlanStatus.BAD_INPUT, 0]] * 2
 
 
 def test_opposite_infinities_are_no_number():
     history = torch.zeros(1, 4, 3)
     history[0, :2, 0] = torch.tensor([INF, -INF])
-    assert input_status(looking(torch.zeros(1, 3), history), None).tolist() == [PlanStatus.BAD_INPUT]
+    assert status_of(looking(torch.zeros(1, 3), history), None).tolist() == [PlanStatus.BAD_INPUT]
 
 
 def test_a_forecast_of_no_use_is_a_target_at_rest():

@@ -13,6 +13,7 @@ from torchdyn_plan import keys
 from torchdyn_plan.checks import check_finite, check_number, check_trailing_shape
 from torchdyn_plan.nets.arrival import ArrivalQuery
 from torchdyn_plan.nets.forecast import Forecast, ForecastModel
+from torchdyn_plan.planners.judging import act, judge_rows
 from torchdyn_plan.planners.memory import Remembering
 from torchdyn_plan.planners.planner import DynamicPlanner
 from torchdyn_plan.planners.protocol import StaticPlanner, keys_read, keys_written, read
@@ -31,13 +32,17 @@ class TargetPursuit(Remembering):
         self.out_keys = keys_written(self.static, keys.GOAL, keys.ARRIVAL_STEPS)
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
-        """Write ``goal`` (*B, 3) [m, world] and ``arrival_steps`` (*B,), which is 0, and act."""
+        """Write ``goal`` (*B, 3) [m, world] and ``arrival_steps`` (*B,), which is 0, and act.
+
+        Rows in which something that is read is no number get action 0.
+        """
         target_pos = read(tensordict, keys.TARGET_POS, "TargetPursuit")
         check_trailing_shape(keys.TARGET_POS, target_pos, 3)
+        bad = judge_rows(tensordict, self.in_keys, target_pos.shape[:-1])
         tensordict.set(keys.GOAL, target_pos)
         now = torch.zeros(target_pos.shape[:-1], dtype=torch.int64, device=target_pos.device)
         tensordict.set(keys.ARRIVAL_STEPS, now)
-        return self.static(tensordict)
+        return act(self.static, tensordict, bad)
 
     def empty_memory(self, like: Tensor) -> dict[str, Tensor]:
         """The static planner's, as `Remembering` says."""

@@ -69,20 +69,22 @@ class PlannerMemory:
         if repeated:
             raise InputError(f"two parts of a planner remember {', '.join(repeated)}: rename a field of a State")
 
-    def recall(self, tensordict: TensorDictBase, observation: Observation) -> list[Any]:
+    def recall(self, tensordict: TensorDictBase, observation: Observation, spoiled: Tensor | None = None) -> list[Any]:
         """The parts' states as they were after the step before, one step older; rows at step 0 start afresh.
 
-        The states are in the order of `slots`. Where a tensordict holds none, everything starts afresh, with a warning
-        if rows are past step 0.
+        The states are in the order of `slots`. Rows whose memory is ``spoiled`` (*B,) start afresh, too. Where a
+        tensordict holds none, everything does, with a warning if rows are past step 0.
         """
         plan = tensordict.get(keys.PLAN, None)
         # A plain dictionary: a look-up in a tensordict takes as long as a small operation.
         stored = {} if plan is None else dict(plan.items())
         fresh = observation.step_count == 0
-        some_fresh = torch.compiler.is_compiling() or bool(debug_unwrap(fresh).any())
         lost = [name for name in self.names if name not in stored]
         if lost:
             warn_of_loss(lost[0], fresh)
+        if spoiled is not None:
+            fresh = fresh | spoiled
+        some_fresh = torch.compiler.is_compiling() or bool(debug_unwrap(fresh).any())
         states = []
         for slot in self.slots:
             if not stored.keys() >= set(slot.names):

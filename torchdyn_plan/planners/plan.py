@@ -32,7 +32,7 @@ class PlanStatus(IntEnum):
     TARGET_LOST = 4
     """The target is lost."""
     BAD_INPUT = 5
-    """The target's position, or what the forecaster reads, holds a NaN or an infinity."""
+    """Something that is read of the target or the robot is no number, or too large to be a measurement."""
 
 
 class Lost(Protocol):
@@ -142,15 +142,13 @@ class Plan(NamedTuple):
         return torch.where(trouble > 0, trouble, code)
 
 
-def input_status(observation: Observation, lost: Lost | None) -> Tensor:
-    """`BAD_INPUT`, `TARGET_LOST` or `OK` for each row, ``(*B,)`` int64; ``lost`` says when a target is lost."""
+def input_status(observation: Observation, bad: Tensor | None, lost: Lost | None) -> Tensor:
+    """`BAD_INPUT` in the rows ``bad`` (*B,), if any, `TARGET_LOST` where ``lost`` says so, else `OK`: (*B,) int64."""
     target_pos = observation.target_pos
-    # A sum is finite only if all its terms are.
-    total = target_pos.sum(-1)
-    for value in observation.seen:
-        total = total + value.reshape(*total.shape, value.shape[total.ndim :].numel()).sum(-1)
-    bad = (~torch.isfinite(total)) * int(PlanStatus.BAD_INPUT)
-    return bad if lost is None else torch.maximum(bad, lost.seen(target_pos) * int(PlanStatus.TARGET_LOST))
+    code = torch.zeros_like(observation.step_count)
+    if lost is not None:
+        code = lost.seen(target_pos) * int(PlanStatus.TARGET_LOST)
+    return code if bad is None else code.masked_fill(bad, int(PlanStatus.BAD_INPUT))
 
 
 def usable_path(path: Tensor, target_pos: Tensor) -> tuple[Tensor, Tensor]:

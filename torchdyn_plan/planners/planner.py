@@ -13,6 +13,7 @@ from torch.func import debug_unwrap
 from torchdyn_plan import keys
 from torchdyn_plan.checks import check_trailing_shape, hides_values
 from torchdyn_plan.nets.forecast import Forecast, ForecastModel
+from torchdyn_plan.planners.judging import act, judge
 from torchdyn_plan.planners.observation import SEEN_BY_ALL, Observation
 from torchdyn_plan.planners.parts import ComposedPlanner
 from torchdyn_plan.planners.plan import Plan, input_status, usable_path
@@ -29,20 +30,23 @@ class DynamicPlanner(ComposedPlanner):
     Writes ``goal`` (*B, 3) [m, world], ``arrival_steps`` (*B,), what the static planner writes, and under ``plan`` the
     memory for the next step and each row's `PlanStatus`. A row plans when its schedule says so, and starts afresh at
     ``step_count`` 0. One that cannot plan, as its input or forecast is no number or its target is lost, holds its tool
-    still and tries again at every step; other rows do not notice. Its parts are those of `ComposedPlanner`.
+    still and tries again at every step; one whose robot is not seen gets action 0; other rows do not notice. Its parts
+    are those of `ComposedPlanner`.
     """
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         """Plan where a plan is due, and act; raises `InputError` for a missing key or a wrong shape."""
-        obs = observe(tensordict, self.forecaster)
-        clock, plan, state, pending = self.memory.recall(tensordict, obs)
+        seen = observe(tensordict, self.forecaster)
+        obs, found = judge(seen, tensordict, self.read_by_static, self.memory.names)
+        # Not the clean one: a row that begins without being seen must not remember zeros for its place.
+        clock, plan, state, pending = self.memory.recall(tensordict, seen, found.spoiled)
         busy = None
         if self.delivery is not None:
             plan, busy = self.delivery.arrive(plan, pending, obs)
 
         late = partial(lateness, self.eta, obs, plan, self.chunk)
         ticked, due = self.schedule.tick(clock, obs, plan, busy=busy, late=late)
-        trouble = input_status(obs, self.lost)
+        trouble = input_status(obs, found.bad_input, self.lost)
         planned, holds = due, ~plan.usable
         if self.delivery is not None or torch.compiler.is_compiling() or debug_unwrap(due).any():
             able = due & (trouble == 0)
@@ -63,7 +67,7 @@ class DynamicPlanner(ComposedPlanner):
         self.memory.remember(tensordict, (ticked, plan, state, pending), replanned=planned, status=status)
         tensordict.set(keys.GOAL, goal)
         tensordict.set(keys.ARRIVAL_STEPS, plan.arrival_steps)
-        return self.static(tensordict)
+        return act(self.static, tensordict, found.blind)
 
     def replan(self, observation: Observation, plan: Plan) -> Plan:
         """A new plan for every row, from what is seen and the plan in use: pure, and the one entry to planning."""

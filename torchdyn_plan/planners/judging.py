@@ -1,0 +1,130 @@
+"""Which rows of what a planner reads are of use: judged once a step, in one place."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any, NamedTuple
+
+import torch
+from tensordict import TensorDictBase
+from torch import Tensor
+from torch.func import debug_unwrap
+
+from torchdyn_plan import keys
+from torchdyn_plan.checks import hides_values
+from torchdyn_plan.planners.observation import Observation
+
+LARGEST = 1e6
+"""Nothing that robots and targets measure is larger, in its units [m, rad, s]."""
+
+
+class Judgement(NamedTuple):
+    """Rows of which something is no number, or too large to be one; None where every row is good."""
+
+    blind: Tensor | None = None
+    """``(*B,)`` bool: what is read of the robot, or what its static planner remembers, is bad."""
+    bad_input: Tensor | None = None
+    """``(*B,)`` bool: what is read of the robot or of the target is bad."""
+    spoiled: Tensor | None = None
+    """``(*B,)`` bool: what the planner remembers is bad."""
+
+
+GOOD = Judgement()
+"""Of a step in which every row is good."""
+
+
+def judge(
+    observation: Observation, tensordict: TensorDictBase, read_by_static: Sequence[Any], remembered: Sequence[str]
+) -> tuple[Observation, Judgement]:
+    """Judge everything that a planner reads.
+
+    Args:
+        observation: what it sees.
+        tensordict: of which it is.
+        read_by_static: keys that its static planner reads beside; those that are absent do not count.
+        remembered: names below ``plan`` that it remembers.
+
+    Returns:
+        The observation with zeros for all that is bad, so that what is computed of these rows is a number, and the
+        judgement.
+    """
+    target = [observation.target_pos, *observation.seen]
+    plan = _stored(tensordict)
+    robot = [observation.tool_pos, observation.robot_state, *_present(tensordict, plan, read_by_static)]
+    memory = [plan[name] for name in remembered if name in plan]
+    if are_sane([*robot, *target, *memory]):
+        return observation, GOOD
+    batch = observation.tool_pos.shape[:-1]
+    blind, unseen, spoiled = (bad_rows(values, batch) for values in (robot, target, memory))
+    clean = observation._replace(
+        tool_pos=_zero(observation.tool_pos, blind),
+        robot_state=_zero(observation.robot_state, blind),
+        target_pos=_zero(observation.target_pos, unseen),
+        seen=tuple(_zero(value, unseen) for value in observation.seen),
+    )
+    return clean, Judgement(blind, blind | unseen, spoiled)
+
+
+def judge_rows(tensordict: TensorDictBase, read: Sequence[Any], batch: torch.Size) -> Tensor | None:
+    """As `bad_rows`, of the entries ``read`` that are there; None where every row is good."""
+    values = _present(tensordict, _stored(tensordict), read)
+    return None if are_sane(values) else bad_rows(values, batch)
+
+
+def are_sane(values: Sequence[Tensor]) -> bool:
+    """Whether all of ``values`` can be looked at and hold nothing but numbers of a size that a measurement can have."""
+    if torch.compiler.is_compiling() or any(debug_unwrap(value) is not value for value in values):
+        return False
+    flat = torch.cat([value.reshape(-1) for value in values if value.is_floating_point()])
+    if not len(flat):
+        return True
+    low, high = torch.aminmax(flat)
+    return low.item() >= -LARGEST and high.item() <= LARGEST
+
+
+def bad_rows(values: Sequence[Tensor], batch: torch.Size) -> Tensor:
+    """Rows ``(*B,)`` bool in which some of ``values`` (*B, …) is no number, or too large to be a measurement."""
+    bad = torch.zeros(batch, dtype=torch.bool)
+    for value in values:
+        if value.is_floating_point():
+            rows = value.reshape(*batch, value.shape[len(batch) :].numel())
+            bad = bad.to(value.device) | ~(rows.abs() <= LARGEST).all(-1)
+    return bad
+
+
+def act(static: Any, tensordict: TensorDictBase, blind: Tensor | None) -> TensorDictBase:
+    """Let the ``static`` planner act; rows that are ``blind`` (*B,) get action 0, whatever it makes of them.
+
+    It is shown zeros there, in a copy: what was read stays as it was. A goal of theirs that is no number is 0, too.
+    """
+    if blind is None:
+        return static(tensordict)
+    goal = tensordict.get(keys.GOAL)
+    tensordict.set(keys.GOAL, _zero(goal, bad_rows([goal], goal.shape[:-1])))
+    copy = tensordict.copy()
+    for key in static.in_keys:
+        value = tensordict.get(key, None)
+        if isinstance(value, Tensor):
+            copy.set(key, _zero(value, blind))
+    acted = static(copy)
+    tensordict.update(acted.exclude(*(key for key in static.in_keys if key not in static.out_keys)))
+    return tensordict.set(keys.ACTION, _zero(acted.get(keys.ACTION), blind))
+
+
+def _stored(tensordict: TensorDictBase) -> dict[str, Any]:
+    """What is stored below ``plan``, as a plain dictionary: a nested look-up takes as long as an operation."""
+    plan = tensordict.get(keys.PLAN, None)
+    return {} if plan is None else dict(plan.items())
+
+
+def _present(tensordict: TensorDictBase, plan: dict[str, Any], read: Sequence[Any]) -> list[Tensor]:
+    """The entries ``read`` of a tensordict with ``plan`` in it, without those that are absent."""
+    found = (tensordict.get(key, None) if isinstance(key, str) else plan.get(key[-1]) for key in read)
+    return [value for value in found if value is not None]
+
+
+def _zero(value: Tensor, rows: Tensor) -> Tensor:
+    """``value`` (*B, …), but 0 in ``rows`` (*B,)."""
+    if not value.is_floating_point() or not (hides_values(rows) or debug_unwrap(rows).any()):
+        return value
+    return value.masked_fill(rows[(..., *[None] * (value.ndim - rows.ndim))], 0.0)
