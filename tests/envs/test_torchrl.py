@@ -215,6 +215,19 @@ def test_collectors_cut_trajectories_by_torchrls_own_counter(make):
 
 
 @EACH
+def test_one_bad_action_holds_its_row_where_that_is_wished_and_is_an_error_else(make):
+    holding, usual = make(3, on_bad_action="hold"), make(3)
+    action = actions(usual)(usual.reset())["action"]
+    held, spoiled = action.clone(), action.clone()
+    held[1], spoiled[1, 0] = 0.0, float("nan")
+    found = holding.step(holding.reset().set("action", spoiled))["next"]
+    other = make(3)
+    assert_same(found, other.step(other.reset().set("action", held))["next"])
+    with pytest.raises(InputError, match="action must be finite, got 1 NaN"):
+        usual.step(usual.reset().set("action", spoiled))
+
+
+@EACH
 def test_an_observation_can_show_the_goal(make):
     env = make(goal_in_observation=True, max_steps=30)
     rollout = env.rollout(6, actions(env), break_when_any_done=False)
@@ -259,6 +272,8 @@ def test_entries_are_shown_on_the_device_that_was_asked_for(make):
 def test_an_unknown_render_mode_and_a_picture_that_was_not_asked_for_are_refused():
     with pytest.raises(InputError, match="unknown render_mode 'human'"):
         WORLDS["trapper"](render_mode="human")
+    with pytest.raises(InputError, match="unknown on_bad_action 'halt'"):
+        WORLDS["trapper"](on_bad_action="halt")
     with pytest.raises(InputError, match="made with render_mode='rgb_array', got None"):
         WORLDS["trapper"]().render()
     with pytest.raises(InputError, match="PointEnv draws no pictures"):

@@ -25,6 +25,8 @@ ENDS = ("done", "terminated", "truncated")
 
 RENDER_MODES = ("rgb_array",)
 """What `MovingTargetEnv.render` can make."""
+ON_BAD_ACTION = ("raise", "hold")
+"""What becomes of an action that is no number: an error before anything moves, or 0 in its row."""
 
 
 class RobotReading(NamedTuple):
@@ -73,6 +75,7 @@ class MovingTargetEnv(EnvBase):
         max_steps: int = 500,
         goal_in_observation: bool = False,
         render_mode: str | None = None,
+        on_bad_action: str = "raise",
         device: torch.device | str = "cpu",
     ) -> None:
         """Declare the keys, with nothing started yet.
@@ -91,6 +94,8 @@ class MovingTargetEnv(EnvBase):
             goal_in_observation: `observation` ends with the target's place (3) [m, world] and, unless it rests, with
                 its last step (3) [m]: for scripts that show a policy nothing but `observation`.
             render_mode: ``rgb_array`` for pictures by `render`; None for none.
+            on_bad_action: what becomes of an action that is no number: ``raise`` for an `InputError` before anything
+                moves, ``hold`` for an action of 0 in that row.
             device: where entries are shown and actions are expected; the simulation stays on the CPU.
 
         Raises:
@@ -104,9 +109,11 @@ class MovingTargetEnv(EnvBase):
         check_choice("split", split, SPLITS)
         if render_mode is not None:
             check_choice("render_mode", render_mode, RENDER_MODES)
+        check_choice("on_bad_action", on_bad_action, ON_BAD_ACTION)
         super().__init__(device=torch.device(device), batch_size=torch.Size([num_envs]))
         self.static_target, self.history, self.max_steps = static_target, history, max_steps
         self.split, self.goal_in_observation, self.render_mode = split, goal_in_observation, render_mode
+        self.on_bad_action = on_bad_action
         self._begin_series(seed)
         self._episode = torch.zeros(num_envs, dtype=torch.int64)
         # TorchRL's StepCounter and CatFrames would do the next two, at several times the cost of a step.
@@ -271,10 +278,12 @@ class MovingTargetEnv(EnvBase):
         return TensorDict(entries, batch_size=self.batch_size, device=self.device)
 
     def _checked_action(self, tensordict: TensorDictBase) -> Tensor:
-        """The action (N, A); raises `InputError` where it has another shape or holds no number."""
+        """The action (N, A); raises `InputError` where it has another shape, or holds no number and may not."""
         action = tensordict[keys.ACTION]
         check_trailing_shape(keys.ACTION, action, self.num_envs, self.action_spec.shape[-1])
         action = action.detach().cpu()
+        if self.on_bad_action == "hold":
+            return action.masked_fill(~action.isfinite().all(-1, keepdim=True), 0.0)
         check_finite(keys.ACTION, action)
         return action
 

@@ -58,6 +58,7 @@ class TrapperEnv(MovingTargetEnv):
         num_threads: int = 0,
         goal_in_observation: bool = False,
         render_mode: str | None = None,
+        on_bad_action: str = "raise",
         device: torch.device | str = "cpu",
     ) -> None:
         """Build the batch.
@@ -76,6 +77,7 @@ class TrapperEnv(MovingTargetEnv):
             num_threads: native threads of the simulation, 0 for all cores.
             goal_in_observation: `observation` ends with the ball's place and, if it rolls, with its last step.
             render_mode: ``rgb_array`` for pictures by `render`.
+            on_bad_action: ``raise`` an `InputError` for an action that is no number, or ``hold``: 0 in its row.
             device: where entries are shown and actions are expected; the simulation stays on the CPU.
 
         Raises:
@@ -95,6 +97,7 @@ class TrapperEnv(MovingTargetEnv):
             max_steps=max_steps,
             goal_in_observation=goal_in_observation,
             render_mode=render_mode,
+            on_bad_action=on_bad_action,
             device=device,
         )
         self.scene, self.weights = scene or TrapperScene(), weights or GoalReward()
