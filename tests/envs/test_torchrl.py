@@ -1,5 +1,8 @@
 """What TorchRL's users take for granted of an environment, for every one of this package."""
 
+import multiprocessing
+import os
+
 import pytest
 import torch
 from tensordict.nn import TensorDictModule
@@ -225,6 +228,24 @@ def test_one_bad_action_holds_its_row_where_that_is_wished_and_is_an_error_else(
     assert_same(found, other.step(other.reset().set("action", held))["next"])
     with pytest.raises(InputError, match="action must be finite, got 1 NaN"):
         usual.step(usual.reset().set("action", spoiled))
+
+
+def test_an_environment_in_a_forked_process_says_so_and_does_not_hang():
+    env = WORLDS["trapper"](num_threads=2)
+    env.rollout(2)
+    reader, writer = multiprocessing.Pipe(duplex=False)
+
+    def use():
+        try:
+            env.reset()
+        except InputError as error:
+            writer.send(str(error))
+
+    child = multiprocessing.get_context("fork").Process(target=use)
+    child.start()
+    assert reader.poll(60), "it hangs"
+    assert f"was built in process {os.getpid()}, and process {child.pid} uses it" in reader.recv()
+    child.join()
 
 
 @EACH

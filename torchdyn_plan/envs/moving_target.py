@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from abc import abstractmethod
 from collections.abc import Callable, Mapping
 from typing import Any, ClassVar, NamedTuple
@@ -114,6 +115,7 @@ class MovingTargetEnv(EnvBase):
         self.static_target, self.history, self.max_steps = static_target, history, max_steps
         self.split, self.goal_in_observation, self.render_mode = split, goal_in_observation, render_mode
         self.on_bad_action = on_bad_action
+        self._process = os.getpid()
         self._begin_series(seed)
         self._episode = torch.zeros(num_envs, dtype=torch.int64)
         # TorchRL's StepCounter and CatFrames would do the next two, at several times the cost of a step.
@@ -258,6 +260,7 @@ class MovingTargetEnv(EnvBase):
         return episodes
 
     def _reset(self, tensordict: TensorDictBase | None = None, **_: Any) -> TensorDictBase:
+        self._check_process()
         mask = None if tensordict is None else tensordict.get("_reset", None)
         rows = torch.arange(self.num_envs) if mask is None else mask.cpu().reshape(-1).nonzero().squeeze(-1)
         if len(rows):
@@ -267,6 +270,7 @@ class MovingTargetEnv(EnvBase):
         return self._shown(self._observe() | {key: torch.zeros(self.num_envs, 1, dtype=torch.bool) for key in ENDS})
 
     def _step(self, tensordict: TensorDictBase) -> TensorDictBase:
+        self._check_process()
         self._see(self._advance(self._checked_action(tensordict)))
         seen = self._observe()
         terminated, truncated = self._terminated(seen), self._is_over
@@ -277,13 +281,21 @@ class MovingTargetEnv(EnvBase):
         """``entries`` where they are shown: the one move between devices."""
         return TensorDict(entries, batch_size=self.batch_size, device=self.device)
 
+    def _check_process(self) -> None:
+        """Raise `InputError` in another process than the environment's: a simulation's threads do not survive a fork."""
+        if os.getpid() != self._process:
+            raise InputError(
+                f"the environment was built in process {self._process}, and process {os.getpid()} uses it: build it in "
+                "the process that uses it, as ParallelEnv does with a function that makes one"
+            )
+
     def _checked_action(self, tensordict: TensorDictBase) -> Tensor:
         """The action (N, A); raises `InputError` where it has another shape, or holds no number and may not."""
         action = tensordict[keys.ACTION]
         check_trailing_shape(keys.ACTION, action, self.num_envs, self.action_spec.shape[-1])
         action = action.detach().cpu()
         if self.on_bad_action == "hold":
-            return action.masked_fill(~action.isfinite().all(-1, keepdim=True), 0.0)
+            return action.masked_fill(~action.isfinite().all(dim=-1, keepdim=True), 0.0)
         check_finite(keys.ACTION, action)
         return action
 
