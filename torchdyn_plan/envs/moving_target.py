@@ -282,7 +282,7 @@ class MovingTargetEnv(EnvBase):
         return TensorDict(entries, batch_size=self.batch_size, device=self.device)
 
     def _check_process(self) -> None:
-        """Raise `InputError` in another process than the environment's: a simulation's threads do not survive a fork."""
+        """Raise `InputError` in another process than the environment's, as a simulation's threads survive no fork."""
         if os.getpid() != self._process:
             raise InputError(
                 f"the environment was built in process {self._process}, and process {os.getpid()} uses it: build it in "
@@ -295,7 +295,8 @@ class MovingTargetEnv(EnvBase):
         check_trailing_shape(keys.ACTION, action, self.num_envs, self.action_spec.shape[-1])
         action = action.detach().cpu()
         if self.on_bad_action == "hold":
-            return action.masked_fill(~action.isfinite().all(dim=-1, keepdim=True), 0.0)
+            bad = ~torch.isfinite(action).all(dim=-1)
+            return action.masked_fill(bad.unsqueeze(-1), 0.0)
         check_finite(keys.ACTION, action)
         return action
 
