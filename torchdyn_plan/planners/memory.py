@@ -15,6 +15,7 @@ from torch.func import debug_unwrap
 
 from torchdyn_plan import keys
 from torchdyn_plan.errors import InputError
+from torchdyn_plan.planners.explaining import explained
 from torchdyn_plan.planners.maneuver import Maneuver, NoState
 from torchdyn_plan.planners.plan import Plan
 from torchdyn_plan.planners.rows import where_rows
@@ -135,7 +136,15 @@ def remember(tensordict: TensorDictBase, entries: Mapping[str, Tensor]) -> None:
 
 
 class Remembering(TensorDictModuleBase):
-    """A planner that keeps its memory in the tensordict under ``plan``."""
+    """A planner that keeps its memory in the tensordict under ``plan``.
+
+    Where its ``forward`` fails for what is in the tensordict, an `InputError` says so in one sentence.
+    """
+
+    def __init_subclass__(cls, **settings: Any) -> None:
+        super().__init_subclass__(**settings)
+        if "forward" in cls.__dict__:
+            cls.forward = explained(cls.__dict__["forward"])
 
     def empty_memory(self, like: Tensor) -> dict[str, Tensor]:
         """Entries below ``plan`` of rows at step 0, in the batch, type and device of ``like`` (*B, 3); none here."""
