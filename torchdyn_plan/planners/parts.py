@@ -70,8 +70,9 @@ class ComposedPlanner(PretrainedPlanner, Remembering):
             check_number("chunk", chunk, minimum=1, integer=True)
         self.static = TensorDictFunction.wrap(static)
         self.forecaster, self.eta = FunctionForecast.wrap(forecaster), FunctionArrival.wrap(eta)
-        self.search, self.schedule = search or CornerSearch(), schedule or ReplanSchedule()
-        self.maneuver, self.delivery = maneuver or GoTo(), delivery
+        self.search = CornerSearch() if search is None else search
+        self.schedule = ReplanSchedule() if schedule is None else schedule
+        self.maneuver, self.delivery = GoTo() if maneuver is None else maneuver, delivery
         self.lost, self.chunk, self.scene = lost, chunk, scene
         self.memory = PlannerMemory(self.schedule, self.maneuver, delivery)
         remembered = [(keys.PLAN, name) for name in self.memory.names]
