@@ -1,4 +1,4 @@
-"""How many threads torch uses."""
+"""How torch computes: on how many threads, and by which products of matrices."""
 
 from __future__ import annotations
 
@@ -17,3 +17,18 @@ def one_thread() -> Iterator[None]:
         yield
     finally:
         torch.set_num_threads(threads)
+
+
+@contextmanager
+def quick_products() -> Iterator[None]:
+    """Products of float32 matrices by oneDNN on a CPU: twice as fast on AVX-512, and as exact.
+
+    On processors that multiply bfloat16 by themselves (AMX), and on CUDA, some products may be rounded to fewer digits:
+    for learning alone.
+    """
+    before = torch.get_float32_matmul_precision()
+    torch.set_float32_matmul_precision("medium")
+    try:
+        yield
+    finally:
+        torch.set_float32_matmul_precision(before)
