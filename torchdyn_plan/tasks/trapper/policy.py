@@ -37,7 +37,7 @@ class ChosenBallsEnv(TrapperEnv):
 
     def __init__(self, numbers: Tensor, **settings: Any) -> None:
         """Play episodes ``numbers`` (E,); ``settings`` are `TrapperEnv`'s."""
-        super().__init__(min(len(numbers), SIDE_BY_SIDE), velocity=0.0, split="dev", **settings)
+        super().__init__(min(len(numbers), SIDE_BY_SIDE), velocity=0.0, seed=0, split="dev", **settings)
         self.numbers = numbers
 
     def _start(self, rows: Tensor, episodes: Tensor) -> Tensor:
