@@ -264,13 +264,14 @@ def main(arguments: Arguments) -> None:
             about = {"what": name, "seed": seed, "minutes": arguments.minutes}
             study.row(about, partial(train, name, seed, task, arguments))
             study.save(peers=peers)
+    rows = [row for row in study.rows if row["minutes"] == arguments.minutes]
     places = np.arange(0.0, 60.0 * arguments.minutes + 1.0, 15.0)
-    found = curves(study.rows, "seconds", places, arguments.draws)
+    found = curves(rows, "seconds", places, arguments.draws)
     study.save(peers=peers, interquartile_means=found)
     for name, points in found.items():
         print(told({"what": name, "success at the end": points[-1][1], "interval": points[-1][2:]}))
     if arguments.out is not None:
-        plot(study.rows, arguments)
+        plot(rows, arguments)
 
 
 if __name__ == "__main__":
