@@ -245,7 +245,7 @@ def plot(rows: list[Row], arguments: Arguments) -> None:
             axes.plot(shown[:, 0] / unit, shown[:, 1], label=label_of_line)
             axes.fill_between(shown[:, 0] / unit, shown[:, 2], shown[:, 3], alpha=0.2)
         axes.axhline(arguments.target, color="grey", linewidth=0.8, linestyle="--")
-        axes.set(xlabel=label, ylim=(0.0, 1.02))
+        axes.set(xlabel=label, ylim=(-0.03, 1.02))
     panels[1].set_xscale("log")
     panels[0].set_ylabel("resting balls within reach trapped")
     panels[1].legend(loc="upper left", fontsize="small")

@@ -21,7 +21,7 @@ def one_thread() -> Iterator[None]:
 
 @contextmanager
 def quick_products() -> Iterator[None]:
-    """Products of float32 matrices by oneDNN on a CPU: twice as fast on AVX-512, and as exact.
+    """Products of float32 matrices by oneDNN on a CPU: twice as fast on AVX-512, and about as exact.
 
     On processors that multiply bfloat16 by themselves (AMX), and on CUDA, some products may be rounded to fewer digits:
     for learning alone.
