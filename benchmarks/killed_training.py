@@ -29,12 +29,14 @@ class Arguments:
     """Shortest and longest time from a start to the kill [s]."""
     seed: int = 7
     """Of both trainings."""
+    algorithm: str = "ddpg"
+    """How they learn."""
 
 
 def start(arguments: Arguments, out: Path) -> subprocess.Popen[bytes]:
     """`torchdyn-plan train policy` into ``out``."""
     run = [sys.executable, "-c", "from torchdyn_plan.cli import main; main()", "train", "policy", "--out", str(out)]
-    settings = ["--steps", str(arguments.rounds), "--seed", str(arguments.seed)]
+    settings = ["--steps", str(arguments.rounds), "--seed", str(arguments.seed), "--algorithm", arguments.algorithm]
     return subprocess.Popen([*run, *settings], stderr=subprocess.DEVNULL)
 
 

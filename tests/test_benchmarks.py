@@ -21,6 +21,7 @@ SMALL = {
     "joint_speeds": "--episodes 4 --num-envs 4",
     "loops": "--planners corner --episodes 4 --steps 30 --loops rollout",
     "latency": "--velocities 5 --episodes 2 --latencies 0 20 --not-compensated 20",
+    "reach_at_rest": "--episodes 4 --threads 1",
     "reach_ceiling": "--velocities 0.03 --episodes 8 --other-velocities 0.03 --other-episodes 8 --bounds-alone",
     "reach_env": "--copies 2 --steps 4 --threads 1",
     "recovery": "--planners wait_and_drop --statics ik --velocities 5 --episodes 2 --num-envs 2 --split dev",

@@ -121,6 +121,8 @@ def test_each_network_shows_its_own_options_alone(capsys):
         assert word in dher
     assert "--data" in forecaster
     assert "--data" not in policy
+    assert "--algorithm {ddpg,averaged}" in policy
+    assert "--algorithm" not in forecaster
     assert "--period" in policy
     assert "--period" not in dher
     assert "--velocity" in dher
@@ -188,6 +190,10 @@ BAD = [
     (["train", "eta", "--lr", "nan", "--out", "{out}"], "lr must be a finite number, got nan"),
     (["train", "eta", "--device", "gpu", "--data", "{new}", "--out", "{out}"], "device 'gpu' cannot be used"),
     (["train", "policy", "--num-envs", "0", "--out", "{out}"], "num_envs must be >= 1, got 0"),
+    (
+        ["train", "policy", "--algorithm", "sac", "--out", "{out}"],
+        "unknown algorithm 'sac'; choose from averaged, ddpg",
+    ),
     (["train", "policy", "--period", "0", "--out", "{out}"], "period must be >= 1, got 0"),
     (["train", "dher", "--task", "fetch_reach", "--velocity", "1", "--out", "{out}"], "velocity must be in [0, 0.2]"),
     (["train", "policy", "--out", "{file}"], "output folder '{file}' is not writable"),

@@ -1,4 +1,4 @@
-"""How many threads torch uses."""
+"""How torch computes: on how many threads, and by which products of matrices."""
 
 from __future__ import annotations
 
@@ -22,3 +22,18 @@ def torch_threads(count: int) -> Iterator[None]:
 def one_thread() -> AbstractContextManager[None]:
     """Torch on one thread: networks this small are fastest on one, which leaves the cores to the simulation."""
     return torch_threads(1)
+
+
+@contextmanager
+def quick_products() -> Iterator[None]:
+    """Products of float32 matrices by oneDNN on a CPU: twice as fast on AVX-512, and about as exact.
+
+    On processors that multiply bfloat16 by themselves (AMX), and on CUDA, some products may be rounded to fewer digits:
+    for learning alone.
+    """
+    before = torch.get_float32_matmul_precision()
+    torch.set_float32_matmul_precision("medium")
+    try:
+        yield
+    finally:
+        torch.set_float32_matmul_precision(before)

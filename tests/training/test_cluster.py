@@ -8,7 +8,9 @@ from torchdyn_plan.errors import InputError
 from torchdyn_plan.training.goal_task import DDPGRecipe
 
 pytest.importorskip("ray")
-from torchdyn_plan.training.cluster import ClusterDDPG
+from torchdyn_plan.training.averaged import AveragedDDPG
+from torchdyn_plan.training.cluster import ClusterDDPG, on_cluster
+from torchdyn_plan.training.ddpg import DDPG
 
 
 def test_two_workers_learn_the_same_task(monkeypatch: pytest.MonkeyPatch, request: pytest.FixtureRequest) -> None:
@@ -30,3 +32,10 @@ def test_two_workers_learn_the_same_task(monkeypatch: pytest.MonkeyPatch, reques
 def test_environments_are_spread_evenly() -> None:
     with pytest.raises(InputError, match="workers must divide num_envs 16 evenly, got 3"):
         ClusterDDPG(PointTask(), DDPGRecipe(num_envs=16), workers=3)
+
+
+def test_every_way_to_learn_can_have_workers() -> None:
+    assert on_cluster(DDPG) is ClusterDDPG
+    averaged = on_cluster(AveragedDDPG)
+    assert averaged.make_collector is ClusterDDPG.make_collector
+    assert averaged.differentiate is AveragedDDPG.differentiate

@@ -1,4 +1,4 @@
-"""DDPG with hindsight: it learns, resumes exactly, keeps the best, and refuses what does not fit."""
+"""DDPG with hindsight, and its averaged form: they learn, resume exactly, keep the best, refuse what does not fit."""
 
 import csv
 import os
@@ -6,19 +6,25 @@ import signal
 import subprocess
 import sys
 import time
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
 import torch
+from safetensors.torch import load_file
 
 from tests.training.points import PointTask
 from torchdyn_plan.errors import InputError, TrainingError
 from torchdyn_plan.nets.policy import Actor
+from torchdyn_plan.training.algorithms import ALGORITHMS, learner_type, recipe_for
+from torchdyn_plan.training.averaged import AveragedDDPG, AveragedRecipe
 from torchdyn_plan.training.ddpg import DDPG
 from torchdyn_plan.training.goal_task import DDPGRecipe
 from torchdyn_plan.training.policy import fit_policy
 
 RECIPE = DDPGRecipe(iterations=12, num_envs=8, updates=20, batch=64, capacity=500, warmup=2, gamma=0.9)
+RECIPES = {"ddpg": RECIPE, "averaged": AveragedRecipe.like(RECIPE)}
+RECIPES["averaged"] = replace(RECIPES["averaged"], iterations=12, gamma=0.9)
 
 
 class CutError(Exception):
@@ -42,8 +48,9 @@ def weights(folder: Path) -> dict[str, torch.Tensor]:
     return Actor.from_pretrained(folder / "policy").state_dict()
 
 
-def test_learns_to_reach(tmp_path: Path) -> None:
-    recipe = DDPGRecipe(iterations=30, num_envs=16, updates=30, batch=128, capacity=20_000, warmup=2, gamma=0.9)
+@pytest.mark.parametrize("kind", [DDPGRecipe, AveragedRecipe])
+def test_learns_to_reach(kind: type[DDPGRecipe], tmp_path: Path) -> None:
+    recipe = kind(iterations=30, num_envs=16, updates=30, batch=128, capacity=20_000, warmup=2, gamma=0.9)
     fit_policy(PointTask(), tmp_path, recipe=recipe, score_every=10)
     with (tmp_path / "policy" / "curve.csv").open() as file:
         rows = list(csv.DictReader(file))
@@ -54,12 +61,14 @@ def test_learns_to_reach(tmp_path: Path) -> None:
     assert "success" in (tmp_path / "policy" / "policy.md").read_text()
 
 
-def test_interrupted_training_ends_where_an_undisturbed_one_does(tmp_path: Path) -> None:
-    fit_policy(PointTask(), tmp_path / "whole", recipe=RECIPE, score_every=2)
+@pytest.mark.parametrize("algorithm", ALGORITHMS)
+def test_interrupted_training_ends_where_an_undisturbed_one_does(algorithm: str, tmp_path: Path) -> None:
+    recipe = RECIPES[algorithm]
+    fit_policy(PointTask(), tmp_path / "whole", recipe=recipe, score_every=2)
     for scores in (1, 2):
         with pytest.raises(CutError):
-            fit_policy(CutTask(scores), tmp_path / "cut", recipe=RECIPE, score_every=2)
-    fit_policy(PointTask(), tmp_path / "cut", recipe=RECIPE, score_every=2)
+            fit_policy(CutTask(scores), tmp_path / "cut", recipe=recipe, score_every=2)
+    fit_policy(PointTask(), tmp_path / "cut", recipe=recipe, score_every=2)
     whole, cut = weights(tmp_path / "whole"), weights(tmp_path / "cut")
     assert all(torch.equal(value, cut[name]) for name, value in whole.items())
     curves = []
@@ -67,18 +76,22 @@ def test_interrupted_training_ends_where_an_undisturbed_one_does(tmp_path: Path)
         with (tmp_path / folder / "policy" / "curve.csv").open() as file:
             curves.append([{k: v for k, v in row.items() if k != "seconds"} for row in csv.DictReader(file)])
     assert curves[0] == curves[1]
+    one, other = (load_file(tmp_path / name / "policy" / "checkpoint.safetensors") for name in ("whole", "cut"))
+    assert one.keys() == other.keys()
+    assert all(torch.equal(value, other[name]) for name, value in one.items())
 
 
-def test_killed_training_resumes(tmp_path: Path) -> None:
+@pytest.mark.parametrize("algorithm", ALGORITHMS)
+def test_killed_training_resumes(algorithm: str, tmp_path: Path) -> None:
     """A real process, killed with SIGKILL when it has written a checkpoint, leaves a folder that goes on exactly."""
-    fit_policy(PointTask(), tmp_path / "whole", recipe=RECIPE, score_every=2)
+    fit_policy(PointTask(), tmp_path / "whole", recipe=RECIPES[algorithm], score_every=2)
     code = (
         "from pathlib import Path; import sys; sys.path.insert(0, sys.argv[2])\n"
-        "from tests.training.points import PointTask; from tests.training.test_policy import RECIPE\n"
+        "from tests.training.points import PointTask; from tests.training.test_policy import RECIPES\n"
         "from torchdyn_plan.training.policy import fit_policy\n"
-        "fit_policy(PointTask(), Path(sys.argv[1]), recipe=RECIPE, score_every=2)"
+        "fit_policy(PointTask(), Path(sys.argv[1]), recipe=RECIPES[sys.argv[3]], score_every=2)"
     )
-    words = [sys.executable, "-c", code, str(tmp_path / "killed"), str(Path(__file__).parents[2])]
+    words = [sys.executable, "-c", code, str(tmp_path / "killed"), str(Path(__file__).parents[2]), algorithm]
     process = subprocess.Popen(words, stderr=subprocess.DEVNULL)
     checkpoint = tmp_path / "killed" / "policy" / "checkpoint.safetensors"
     deadline = time.monotonic() + 120
@@ -87,7 +100,7 @@ def test_killed_training_resumes(tmp_path: Path) -> None:
     os.kill(process.pid, signal.SIGKILL)
     process.wait()
     assert checkpoint.exists()
-    fit_policy(PointTask(), tmp_path / "killed", recipe=RECIPE, score_every=2)
+    fit_policy(PointTask(), tmp_path / "killed", recipe=RECIPES[algorithm], score_every=2)
     whole, killed = weights(tmp_path / "whole"), weights(tmp_path / "killed")
     assert all(torch.equal(value, killed[name]) for name, value in whole.items())
 
@@ -106,7 +119,8 @@ def test_the_best_policy_is_kept(tmp_path: Path) -> None:
     assert all(torch.equal(value, best[name]) for name, value in kept[4].items())
 
 
-def test_nan_stops_and_leaves_the_last_checkpoint(tmp_path: Path) -> None:
+@pytest.mark.parametrize("algorithm", ALGORITHMS)
+def test_nan_stops_and_leaves_the_last_checkpoint(algorithm: str, tmp_path: Path) -> None:
     class Broken(PointTask):
         rounds = 0
 
@@ -116,8 +130,8 @@ def test_nan_stops_and_leaves_the_last_checkpoint(tmp_path: Path) -> None:
             return value * float("nan") if Broken.rounds > 100 else value
 
     with pytest.raises(TrainingError, match=r"round 8, update 1: loss of the actor .*critic nan.*checkpoint is kept"):
-        fit_policy(Broken(), tmp_path, recipe=RECIPE, score_every=2)
-    fit_policy(PointTask(), tmp_path, recipe=RECIPE, score_every=2)
+        fit_policy(Broken(), tmp_path, recipe=RECIPES[algorithm], score_every=2)
+    fit_policy(PointTask(), tmp_path, recipe=RECIPES[algorithm], score_every=2)
 
 
 def test_refuses_another_configuration_before_anything_is_written(tmp_path: Path) -> None:
@@ -127,6 +141,10 @@ def test_refuses_another_configuration_before_anything_is_written(tmp_path: Path
     other = DDPGRecipe(iterations=2, num_envs=8, updates=2, batch=32, capacity=500, warmup=1, gamma=0.9)
     with pytest.raises(TrainingError, match=r"made with recipe .*'batch': 64"):
         fit_policy(PointTask(), tmp_path, recipe=other, score_every=1)
+
+    faster = AveragedRecipe(iterations=2, num_envs=8, updates=2, batch=64, capacity=500, warmup=1, gamma=0.9)
+    with pytest.raises(TrainingError, match="made with algorithm 'ddpg', not 'averaged'"):
+        fit_policy(PointTask(), tmp_path, recipe=faster, score_every=1)
 
     class Other(PointTask):
         def settings(self) -> dict[str, str]:
@@ -155,3 +173,78 @@ def test_targets_follow_and_statistics_reach_every_network() -> None:
     target = ddpg.loss.target_actor_network_params["module", "body", "0", "weight"].data
     online = ddpg.actor.body[0].weight
     assert 0 < (target - online).abs().max() < 0.1
+
+
+@pytest.mark.parametrize(("name", "value"), [("delay", 0), ("average", 0.0), ("average", 1.5), ("gamma", 2.0)])
+def test_refuses_impossible_averages(name: str, value: float) -> None:
+    with pytest.raises(InputError, match=name):
+        AveragedRecipe(**{name: value})
+
+
+def test_a_recipe_is_carried_over_to_another_algorithm() -> None:
+    of_task = DDPGRecipe(num_envs=7, capacity=900, clip_return=True, seed=3, gamma=0.5, iterations=11)
+    averaged = recipe_for("averaged", of_task)
+    assert (averaged.num_envs, averaged.capacity, averaged.clip_return, averaged.seed) == (7, 900, True, 3)
+    assert (averaged.gamma, averaged.iterations) == (AveragedRecipe().gamma, AveragedRecipe().iterations)
+    assert recipe_for("ddpg", averaged) == replace(
+        of_task, gamma=DDPGRecipe().gamma, iterations=DDPGRecipe().iterations
+    )
+    assert recipe_for("ddpg", of_task) is of_task
+    with pytest.raises(InputError, match=r"unknown algorithm 'avereged' \(did you mean 'averaged'\?\)"):
+        recipe_for("avereged", of_task)
+
+
+@pytest.mark.parametrize("algorithm", ALGORITHMS)
+def test_an_algorithm_learns_by_recipes_of_its_name(algorithm: str) -> None:
+    learner = learner_type(algorithm)(PointTask(), recipe_for(algorithm, RECIPE))
+    assert learner.recipe.algorithm == algorithm
+    learner.close()
+
+
+def test_the_actor_waits_and_its_average_lags_behind_it() -> None:
+    learner = AveragedDDPG(PointTask(), replace(RECIPES["averaged"], delay=3, average=0.25, tau=0.5))
+    for _ in range(2):
+        learner.iterate()
+    learner.standardise()
+    shift = learner.actor.features.shift
+    assert shift.abs().sum() > 0
+    assert all(torch.equal(network.features.shift, shift) for network in learner.networks.values())
+
+    def weight(network: torch.nn.Module) -> torch.Tensor:
+        return network.body[0].weight.detach().clone()
+
+    for number in range(4):
+        before = {name: weight(network) for name, network in learner.networks.items()}
+        learner.update(learner.replay.sample(), number)
+        after = {name: weight(network) for name, network in learner.networks.items()}
+        assert not torch.equal(before["critic"], after["critic"])
+        assert torch.equal(before["actor"], after["actor"]) == (number % 3 != 0)
+        for name, leader, share in (("average", "actor", 0.25), ("target_critic", "critic", 0.5)):
+            torch.testing.assert_close(after[name], torch.lerp(before[name], after[leader], share))
+    assert learner.learned is learner.average
+
+
+def test_values_are_targets_discounted_and_stop_where_an_episode_does() -> None:
+    learner = AveragedDDPG(PointTask(), RECIPES["averaged"])
+    for _ in range(2):
+        learner.iterate()
+    batch = learner.replay.sample()
+    batch["next", "terminated"][::2] = True
+    targets = learner.value_targets(batch)
+    assert torch.equal(targets[::2], batch["next", "reward"][::2])
+    after = batch["next"]
+    for row in (1, 3, 5):
+        state, goal = after["observation"][row], after["desired_goal"][row]
+        value = learner.target_critic(state, goal, learner.target_actor(state, goal))
+        torch.testing.assert_close(targets[row], after["reward"][row] + 0.9 * value)
+    bounded = AveragedDDPG(PointTask(), replace(RECIPES["averaged"], clip_return=True))
+    batch["next", "reward"][:] = -100.0
+    assert (bounded.value_targets(batch) == -1.0 / (1.0 - 0.9)).all()
+
+
+def test_the_precision_of_products_is_as_it_was_after_a_round() -> None:
+    before = torch.get_float32_matmul_precision()
+    learner = AveragedDDPG(PointTask(), RECIPES["averaged"])
+    for _ in range(3):
+        learner.iterate()
+    assert torch.get_float32_matmul_precision() == before

@@ -81,6 +81,13 @@ def test_a_policy_learns_by_the_recipe_of_its_task(tmp_path):
     assert all(torch.equal(one[name], other[name]) for name in one)
 
 
+def test_a_policy_learns_by_the_algorithm_that_is_named(tmp_path):
+    file = train(TASK, "policy", tmp_path, tmp_path, steps=3, algorithm="averaged")
+    assert "algorithm: averaged" in file.with_suffix(".md").read_text()
+    with pytest.raises(TrainingError, match="made with algorithm 'averaged', not 'ddpg'"):
+        train(TASK, "policy", tmp_path, tmp_path, steps=3)
+
+
 def test_a_learning_rate_is_the_critics_and_the_actors_in_proportion():
     assert (DDPGRecipe().with_rate(3e-4).lr_critic, DDPGRecipe().with_rate(3e-4).lr_actor) == (3e-4, 3e-4 / 2)
     even = DDPGRecipe(lr_actor=1e-3, lr_critic=1e-3).with_rate(3e-4)
@@ -94,6 +101,8 @@ def test_a_learning_rate_is_the_critics_and_the_actors_in_proportion():
         ("eta", {"num_envs": 4}, "num_envs is of policies, which learn by trial: eta has none, got 4"),
         ("forecaster", {"workers": 2}, "workers is of policies"),
         ("eta", {"options": LearnOptions()}, "options is of policies"),
+        ("eta", {"algorithm": "ddpg"}, "algorithm is of policies"),
+        ("policy", {"algorithm": "sac"}, "unknown algorithm 'sac'; choose from averaged, ddpg"),
         ("eta", {"steps": 0}, "steps must be >= 1"),
         ("policy", {"options": 3}, "options of policy must be LearnOptions, got int"),
         ("policy", {"steps": 0}, "iterations must be >= 1"),

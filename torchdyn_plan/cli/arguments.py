@@ -136,6 +136,7 @@ class PolicyArguments(TrainArguments):
     """Threads of the simulation, 0 for all cores; does not change the result."""
     workers: int = 0
     """Ray workers that run the episodes, 0 to run them in this process."""
+    algorithm: str | None = None
     training: Any = None
 
 

@@ -99,6 +99,7 @@ def train(task: Task, network: str, arguments: TrainArguments) -> None:
     if isinstance(arguments, PolicyArguments):
         own["options"] = task.policies[network].options(**asdict(arguments.training))
         own |= {"num_envs": arguments.num_envs, "num_threads": arguments.threads, "workers": arguments.workers}
+        own["algorithm"] = arguments.algorithm
     train(
         task,
         network,

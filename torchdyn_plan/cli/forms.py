@@ -79,13 +79,18 @@ def bench_forms(task: Task, named: str) -> dict[str, type[Arguments]]:
 
 def train_forms(task: Task, named: str) -> dict[str, type[Arguments]]:
     """The arguments of training each network of ``task``, which the words call ``named``."""
+    from torchdyn_plan.training.algorithms import ALGORITHMS
     from torchdyn_plan.training.train import networks
 
     fitted = [network for network in networks(task) if network not in task.policies]
     forms = {network: _form(FitArguments, FITTED[network], task=_task_option(named)) for network in fitted}
     for name, training in task.policies.items():
         options = _group(_plain(training.options))
-        forms[name] = _form(PolicyArguments, training.summary, task=_task_option(named), training=options)
+        text = "How it learns: averaged takes the least time; the recipe's own way when not given, which is ddpg."
+        algorithm = _option(str | None, text, choices=ALGORITHMS, default=None)
+        forms[name] = _form(
+            PolicyArguments, training.summary, task=_task_option(named), training=options, algorithm=algorithm
+        )
     return forms
 
 

@@ -9,6 +9,7 @@ from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
+    from torchdyn_plan.training.averaged import AveragedRecipe
     from torchdyn_plan.training.fitting import ExtraCoverage, Fitting
     from torchdyn_plan.training.goal_task import DDPGRecipe, GoalTask
     from torchdyn_plan.training.optimise import Recipe
@@ -17,6 +18,7 @@ if TYPE_CHECKING:
     from torchdyn_plan.training.windows import WindowConfig
 
 _PLACES = {
+    "AveragedRecipe": "averaged",
     "DDPGRecipe": "goal_task",
     "ExtraCoverage": "fitting",
     "Fitting": "fitting",
@@ -30,6 +32,7 @@ _PLACES = {
 """Module of this folder that defines each name."""
 
 __all__ = [
+    "AveragedRecipe",
     "DDPGRecipe",
     "ExtraCoverage",
     "Fitting",

@@ -16,6 +16,11 @@ from torchdyn_plan.training.ddpg import DDPG
 from torchdyn_plan.training.goal_task import DDPGRecipe, GoalTask
 
 
+def on_cluster(kind: type[DDPG]) -> type[Any]:
+    """``kind``, `DDPG` or what learns in another way, with its episodes run by workers, as of `ClusterDDPG`."""
+    return ClusterDDPG if kind is DDPG else type(f"Cluster{kind.__name__}", (ClusterDDPG, kind), {})
+
+
 class ClusterDDPG(DDPG):
     """`DDPG` whose environments are spread evenly over Ray workers; each worker has its own series of episodes.
 

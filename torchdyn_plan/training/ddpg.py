@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from typing import Any
 
 import torch
@@ -35,17 +35,7 @@ class DDPG:
         self.actor = Actor(task.policy_config).to(self.device)
         self.critic = Critic(task.policy_config).to(self.device)
         policy = TensorDictModule(self.actor, in_keys=SEEN, out_keys=[keys.ACTION])
-        value = ValueOperator(self.critic, in_keys=[*SEEN, keys.ACTION])
-        self.loss = PenalisedDDPGLoss(policy, value, delay_actor=True, delay_value=True)
-        self.loss.make_value_estimator(self.make_targets())
-        self.targets = SoftUpdate(self.loss, tau=recipe.tau)
-        groups = [
-            {"params": list(self.loss.actor_network_params.values(True, True)), "lr": recipe.lr_actor},
-            {"params": list(self.loss.value_network_params.values(True, True)), "lr": recipe.lr_critic},
-        ]
-        for parameters in groups:
-            parameters["params"] = [entry for entry in parameters["params"] if isinstance(entry, nn.Parameter)]
-        self.optimiser = torch.optim.Adam(groups, fused=True)
+        self.prepare(policy)
         self.replay: GoalReplay = task.make_replay(recipe, self.device)
         self.env: Any = task.make_env(recipe.num_envs, seed=recipe.seed)
         spec = self.env.action_spec_unbatched
@@ -55,9 +45,34 @@ class DDPG:
         self.collector: Any = self.make_collector(TensorDictSequential(*steps))
         self._rollouts: Iterator[TensorDictBase] = iter(self.collector)
 
+    def prepare(self, policy: TensorDictModule) -> None:
+        """Make what updates need beside actor and critic; ``policy`` is the actor as a module of tensordicts."""
+        value = ValueOperator(self.critic, in_keys=[*SEEN, keys.ACTION])
+        self.loss = PenalisedDDPGLoss(policy, value, delay_actor=True, delay_value=True)
+        self.loss.make_value_estimator(self.make_targets())
+        self.loss.action_penalty = self.recipe.greatest_penalty
+        self.networks: nn.Module = self.loss
+        self.targets = SoftUpdate(self.loss, tau=self.recipe.tau)
+        self.optimiser = self.make_optimiser(
+            self.loss.actor_network_params.values(True, True), self.loss.value_network_params.values(True, True)
+        )
+
+    def make_optimiser(self, actor: Iterable[Any], critic: Iterable[Any]) -> torch.optim.Optimizer:
+        """Adam with one group of parameters for each network, at its own rate."""
+        groups = [
+            {"params": [entry for entry in entries if isinstance(entry, nn.Parameter)], "lr": rate}
+            for entries, rate in ((actor, self.recipe.lr_actor), (critic, self.recipe.lr_critic))
+        ]
+        return torch.optim.Adam(groups, fused=True)
+
+    @property
+    def learned(self) -> Actor:
+        """The policy that the training is for: what is scored and kept."""
+        return self.actor
+
     def make_targets(self) -> Any:
         """What computes the critic's targets."""
-        lowest, highest = (-1.0 / (1.0 - self.recipe.gamma), 0.0) if self.recipe.clip_return else (-math.inf, math.inf)
+        lowest, highest = self.recipe.bounds
         targets = BoundedTD0(
             lowest=lowest, highest=highest, gamma=self.recipe.gamma, value_network=self.loss.actor_critic
         )
@@ -84,7 +99,6 @@ class DDPG:
         if not warm:
             if self.iteration == self.recipe.warmup:
                 self.standardise()
-            self.loss.action_penalty = self.recipe.action_penalty / (1.0 - self.recipe.gamma)
             figures |= self.improve()
         self.iteration += 1
         return figures
@@ -123,26 +137,42 @@ class DDPG:
 
     def update(self, batch: TensorDictBase, number: int = 0) -> dict[str, Tensor]:
         """One step of both networks and of their targets; raises `TrainingError` where a loss is no number."""
+        self.optimiser.zero_grad(set_to_none=True)
+        figures = self.differentiate(batch, number)
+        norms = [nn.utils.clip_grad_norm_(entry["params"], self.recipe.clip) for entry in self.optimiser.param_groups]
+        self.check_update(number, figures["loss_actor"], figures["loss_critic"], *norms)
+        self.optimiser.step()
+        self.follow()
+        return figures
+
+    def differentiate(self, batch: TensorDictBase, number: int) -> dict[str, Tensor]:
+        """Fill in the gradients of update ``number`` of a round; returns its losses and mean value."""
         losses = self.loss(batch)
         actor, critic = losses["loss_actor"], losses["loss_value"]
-        self.optimiser.zero_grad(set_to_none=True)
         (actor + critic).backward()
-        norms = [nn.utils.clip_grad_norm_(entry["params"], self.recipe.clip) for entry in self.optimiser.param_groups]
-        figures = [float(value.detach()) for value in (actor, critic, *norms)]
+        value = losses["pred_value"].mean()
+        return {"loss_actor": actor.detach(), "loss_critic": critic.detach(), "value": value.detach()}
+
+    def follow(self) -> None:
+        """Let the targets take over their share of the networks."""
+        self.targets.step()
+
+    def check_update(self, number: int, *values: Tensor) -> None:
+        """Raise `TrainingError` unless losses and gradient norms, actor's and critic's, are numbers."""
+        figures = [float(value) for value in values]
         if not all(map(math.isfinite, figures)):
             raise TrainingError(
                 f"round {self.iteration + 1}, update {number + 1}: loss of the actor {figures[0]:g}, of the critic "
                 f"{figures[1]:g}, gradient norms {figures[2]:g} and {figures[3]:g}: the last checkpoint is kept; try "
                 f"lower learning rates than {self.recipe.lr_actor:g} and {self.recipe.lr_critic:g}"
             )
-        self.optimiser.step()
-        self.targets.step()
-        value = losses["pred_value"].mean()
-        return {"loss_actor": actor.detach(), "loss_critic": critic.detach(), "value": value.detach()}
 
     def tensors(self) -> dict[str, Tensor]:
         """Everything that the next round depends on, by name."""
-        parts: dict[str, dict[str, Tensor]] = {"loss": dict(self.loss.state_dict()), "replay": self.replay.tensors()}
+        parts: dict[str, dict[str, Tensor]] = {
+            "loss": dict(self.networks.state_dict()),
+            "replay": self.replay.tensors(),
+        }
         for index, state in self.optimiser.state_dict()["state"].items():
             parts[f"optimiser.{index}"] = state
         found = {f"{part}.{name}": value for part, values in parts.items() for name, value in values.items()}
@@ -156,7 +186,7 @@ class DDPG:
 
     def restore(self, tensors: dict[str, Tensor], progress: dict[str, Any]) -> None:
         """Go back to where `tensors` and `progress` were taken."""
-        self.loss.load_state_dict(group(tensors, "loss"), strict=False)
+        self.networks.load_state_dict(group(tensors, "loss"), strict=False)
         states: dict[int, dict[str, Tensor]] = {}
         for name, value in group(tensors, "optimiser").items():
             index, _, entry = name.partition(".")

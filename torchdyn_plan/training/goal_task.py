@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import math
 from abc import ABC, abstractmethod
-from dataclasses import dataclass, replace
-from typing import Any, Protocol
+from dataclasses import dataclass, fields, replace
+from typing import Any, ClassVar, Protocol, Self
 
 import torch
 from tensordict import TensorDictBase
@@ -19,6 +19,8 @@ from torchdyn_plan.training.hindsight import HindsightReplayBuffer
 
 SEEN: list[Any] = [keys.OBSERVATION, keys.DESIRED_GOAL]
 """What a policy reads."""
+ALGORITHM_OWNS = ("iterations", "lr_actor", "lr_critic", "final_rate", "gamma", "tau")
+"""Fields of a recipe that follow from how one learns; the others follow from the task."""
 
 
 class GoalReplay(Protocol):
@@ -125,6 +127,9 @@ class DDPGRecipe:
     seed: int = 0
     """Of initialisation, episodes and every draw."""
 
+    algorithm: ClassVar[str] = "ddpg"
+    """What learns by it: one of `torchdyn_plan.training.algorithms.ALGORITHMS`."""
+
     def __post_init__(self) -> None:
         for name in ("iterations", "num_envs", "updates", "batch", "capacity"):
             check_number(name, getattr(self, name), minimum=1, integer=True)
@@ -136,6 +141,22 @@ class DDPGRecipe:
             check_number(name, getattr(self, name), minimum=0.0, maximum=1.0)
         for name in ("noise", "action_penalty"):
             check_number(name, getattr(self, name), minimum=0.0)
+
+    @classmethod
+    def like(cls, recipe: DDPGRecipe) -> Self:
+        """What ``recipe`` asks for on behalf of its task, with this algorithm's own defaults for all else."""
+        names = [one.name for one in fields(DDPGRecipe) if one.name not in ALGORITHM_OWNS]
+        return cls(**{name: getattr(recipe, name) for name in names})
+
+    @property
+    def bounds(self) -> tuple[float, float]:
+        """Least and greatest value that an action can have."""
+        return (-1.0 / (1.0 - self.gamma), 0.0) if self.clip_return else (-math.inf, math.inf)
+
+    @property
+    def greatest_penalty(self) -> float:
+        """What the actor's loss gains by a mean squared action of 1."""
+        return self.action_penalty / (1.0 - self.gamma)
 
     def rate(self, iteration: int) -> float:
         """Factor of the learning rates in ``iteration`` (0 … iterations-1)."""

@@ -21,6 +21,7 @@ from torchdyn_plan.files import write_whole
 from torchdyn_plan.nets.policy import Actor
 from torchdyn_plan.tasks.task import Task
 from torchdyn_plan.threads import one_thread
+from torchdyn_plan.training.algorithms import learner_type, recipe_for
 from torchdyn_plan.training.card import write_card
 from torchdyn_plan.training.checkpoint import group, read_checkpoint, write_checkpoint
 from torchdyn_plan.training.ddpg import DDPG
@@ -35,6 +36,7 @@ def train_policy(
     lr: float | None = None,
     options: Any = None,
     changes: Mapping[str, Any] | None = None,
+    algorithm: str | None = None,
     resume: bool = True,
     num_threads: int = 0,
     workers: int = 0,
@@ -48,6 +50,7 @@ def train_policy(
         out: as for `fit_policy`.
         lr: the critic's learning rate, the actor's in the recipe's proportion; the recipe's own for None.
         options: an instance of the `PolicyTraining.options`; the defaults for None.
+        algorithm: one of `ALGORITHMS`; the recipe's own for None.
         changes: fields of the recipe that are to be others; those that are None stay as they are.
         resume: as for `fit_policy`, as are ``workers`` and ``device``.
         num_threads: of the simulation, 0 for all cores.
@@ -64,6 +67,8 @@ def train_policy(
     if not isinstance(options, training.options):
         raise InputError(f"options of {name} must be {training.options.__name__}, got {type(options).__name__}")
     recipe: DDPGRecipe = training.recipe()
+    if algorithm is not None:
+        recipe = recipe_for(algorithm, recipe)
     if lr is not None:
         recipe = recipe.with_rate(lr)
     recipe = replace(recipe, **{field: value for field, value in (changes or {}).items() if value is not None})
@@ -129,7 +134,8 @@ class _Training:
         self.task, self.folder, self.recipe = task, folder, recipe
         self.score_every, self.workers, self.device = score_every, workers, device
         self.file, self.weights = folder / "checkpoint.safetensors", folder / f"{Actor.kind}.safetensors"
-        self.settings = task.settings() | {"recipe": asdict(recipe), "score_every": score_every}
+        self.settings = task.settings() | {"algorithm": recipe.algorithm, "recipe": asdict(recipe)}
+        self.settings |= {"score_every": score_every}
         self.settings |= {"workers": workers} if workers else {}
         self.curve: list[dict[str, float]] = []
         self.best: dict[str, float] = {}
@@ -165,26 +171,27 @@ class _Training:
         return self.weights
 
     def learner(self) -> DDPG:
+        kind = learner_type(self.recipe.algorithm)
         if self.workers == 0:
-            return DDPG(self.task, self.recipe, device=self.device)
+            return kind(self.task, self.recipe, device=self.device)
         try:
-            from torchdyn_plan.training.cluster import ClusterDDPG
+            from torchdyn_plan.training.cluster import on_cluster
         except ImportError as error:
             raise InputError("workers need Ray: pip install 'torchdyn-plan[ray]'") from error
-        return ClusterDDPG(self.task, self.recipe, workers=self.workers, device=self.device)
+        return on_cluster(kind)(self.task, self.recipe, workers=self.workers, device=self.device)
 
     def score(self, figures: dict[str, float], log: _TensorBoard) -> dict[str, float]:
         """Score the policy, add a row to the curve, and keep the policy if there was none better."""
         transitions = self.ddpg.iteration * self.recipe.num_envs * self.task.length
         with torch.random.fork_rng(devices=[]), torch.no_grad():
-            score = self.task.score(copy.deepcopy(self.ddpg.actor).cpu())
+            score = self.task.score(copy.deepcopy(self.ddpg.learned).cpu())
         place = {"round": self.ddpg.iteration, "transitions": transitions, "seconds": round(self.seconds, 1)}
         self.curve.append(place | figures | score)
         log.add(self.curve[-1], self.ddpg.iteration)
         write_curve(self.folder / "curve.csv", self.curve)
         if not self.best or _rank(score) >= _rank(self.best):
             self.best = score | {"round": self.ddpg.iteration}
-            self.best_actor.load_state_dict(self.ddpg.actor.state_dict())
+            self.best_actor.load_state_dict(self.ddpg.learned.state_dict())
             self.best_actor.save_pretrained(self.weights)
         return score | {"best": self.best["success"]}
 

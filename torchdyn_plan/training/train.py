@@ -37,6 +37,7 @@ def train(
     num_threads: int = 0,
     workers: int = 0,
     options: Any = None,
+    algorithm: str | None = None,
 ) -> Path:
     """Train a network, or go on where its folder stands.
 
@@ -56,6 +57,7 @@ def train(
         num_threads: of a policy: threads of the simulation, 0 for all cores; does not change the result.
         workers: of a policy: Ray workers that run the episodes, 0 for none.
         options: of a policy: an instance of its `PolicyTraining.options`; the defaults for None.
+        algorithm: of a policy: ``ddpg``, ``averaged``; that of the task's recipe for None.
 
     Returns:
         The weights' file.
@@ -74,8 +76,10 @@ def train(
 
         rounds = {"iterations": steps, "num_envs": num_envs}
         machine = {"num_threads": num_threads, "workers": workers, "device": device, "resume": resume}
-        return train_policy(task, network, out, lr=lr, options=options, changes=given | rounds, **machine)
-    _refuse_policy_arguments(network, num_envs=num_envs, workers=workers or None, options=options)
+        return train_policy(
+            task, network, out, lr=lr, options=options, algorithm=algorithm, changes=given | rounds, **machine
+        )
+    _refuse_policy_arguments(network, num_envs=num_envs, workers=workers or None, options=options, algorithm=algorithm)
     from torchdyn_plan.training import fit, fit_spread
 
     own = fit.task_fitting(task).recipe(network)

@@ -234,6 +234,7 @@ TASK = Task(
             options=PolicyOptions,
             goal_task=goal_task,
             recipe=recipe,
+            score_every=5,
         )
     },
     paper=paper,
