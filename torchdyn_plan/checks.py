@@ -7,13 +7,12 @@ Values are looked at here, and nowhere while a model is compiled. Under ``torch.
 import difflib
 import math
 from collections.abc import Iterable
-from pathlib import Path
 
 import torch
 from torch import Tensor
 from torch.func import debug_unwrap
 
-from torchdyn_plan.errors import InputError, OutputError
+from torchdyn_plan.errors import InputError
 
 
 def check_trailing_shape(name: str, tensor: Tensor, *trailing: int) -> None:
@@ -108,15 +107,3 @@ def check_device(device: torch.device | str) -> None:
     except (RuntimeError, AssertionError) as error:
         reason = str(error).splitlines()[0]
         raise InputError(f"device {str(device)!r} cannot be used: {reason}") from error
-
-
-def check_writable_folder(folder: Path) -> Path:
-    """Create ``folder`` if needed and return it; raise `OutputError` if it cannot be written to."""
-    try:
-        folder.mkdir(parents=True, exist_ok=True)
-        probe = folder / ".torchdyn_plan_probe"
-        probe.write_bytes(b"x")
-        probe.unlink()
-    except OSError as error:
-        raise OutputError(f"output folder {str(folder)!r} is not writable: {error.strerror or error}") from error
-    return folder

@@ -53,6 +53,8 @@ class EpisodeArguments(Arguments):
     """Time by which every plan comes late, whole control steps; planners that make no plans have none."""
     compensate: bool = True
     """Tell the planners of that time, so that they plan for the moment when the plan is there."""
+    overwrite: bool = False
+    """Take the place of results of something else that the folder holds; otherwise they are left, and refused."""
 
 
 @dataclass(frozen=True, kw_only=True)

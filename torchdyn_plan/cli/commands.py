@@ -37,15 +37,10 @@ def run(task: Task | None, arguments: Arguments) -> None:
 
 def evaluate(task: Task, arguments: EvaluateArguments) -> None:
     """Run the episodes, write the results and print the table."""
-    from torchdyn_plan.checks import check_writable_folder
     from torchdyn_plan.evaluation import evaluate
 
     task.default_settings(**asdict(arguments.settings))
-    if arguments.out is not None:
-        check_writable_folder(arguments.out)
-    found = evaluate(task, arguments.planners, **_shared(task, arguments))
-    if arguments.out is not None:
-        found.save(arguments.out)
+    found = evaluate(task, arguments.planners, out=arguments.out, **_shared(task, arguments))
     print(found.table())
     if arguments.out is not None:
         print(f"\nwritten: {', '.join(str(path) for path in sorted(arguments.out.iterdir()))}")
@@ -70,7 +65,7 @@ def sweep(task: Task, arguments: SweepArguments) -> None:
 
 def collect(task: Task, arguments: CollectArguments) -> None:
     """Gather the data."""
-    from torchdyn_plan.checks import check_writable_folder
+    from torchdyn_plan.files import check_writable_folder
 
     check_writable_folder(arguments.out)
     from torchdyn_plan.training.collect import collect
@@ -90,7 +85,7 @@ def collect(task: Task, arguments: CollectArguments) -> None:
 
 def train(task: Task, network: str, arguments: TrainArguments) -> None:
     """Train the network, or go on where its folder stands."""
-    from torchdyn_plan.checks import check_writable_folder
+    from torchdyn_plan.files import check_writable_folder
 
     check_writable_folder(arguments.out)
     from torchdyn_plan.training.train import train
@@ -159,6 +154,7 @@ def _shared(task: Task, arguments: EpisodeArguments) -> dict[str, Any]:
         "num_threads": arguments.threads,
         "delivery": _delivery(task, arguments),
         "weights": arguments.weights,
+        "overwrite": arguments.overwrite,
         **asdict(arguments.settings),
     }
 

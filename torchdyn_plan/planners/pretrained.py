@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import hashlib
 import importlib
 import json
 import math
@@ -14,9 +15,9 @@ from typing import Any, Protocol, Self, runtime_checkable
 import torch
 from torch import Tensor
 
-from torchdyn_plan.checks import check_choice, check_writable_folder
+from torchdyn_plan.checks import check_choice
 from torchdyn_plan.errors import InputError, WeightsError
-from torchdyn_plan.files import write_json, write_whole
+from torchdyn_plan.files import check_writable_folder, is_file, is_folder, write_json, write_whole
 from torchdyn_plan.nets.pretrained import SHIPPED, Pretrained
 from torchdyn_plan.versions import library_versions
 
@@ -115,6 +116,22 @@ def describe_planner(planner: Any, save: Callable[[Pretrained], str]) -> dict[st
     return {"format": FORMAT, "class": _path_of(type(planner)), "parts": parts}
 
 
+def planner_digest(planner: Any) -> str | None:
+    """A few letters that tell planners apart by their parts, settings and tensors; None for a bare function."""
+    if not isinstance(planner, torch.nn.Module):
+        return None
+    told = hashlib.sha256()
+    for module in planner.modules():
+        settings = (
+            describe_planner(module, lambda network: repr(network.config)) if hasattr(module, "part_settings") else None
+        )
+        told.update(f"{_path_of(type(module))} {json.dumps(settings, sort_keys=True)}".encode())
+    for name, tensor in planner.state_dict().items():
+        told.update(f"{name} {tensor.dtype} {tuple(tensor.shape)}".encode())
+        told.update(tensor.detach().cpu().contiguous().view(-1).view(torch.uint8).numpy().tobytes())
+    return told.hexdigest()[:16]
+
+
 def _describe(value: Any, save: Callable[[Pretrained], str]) -> Any:
     """A part, or a setting of one, as JSON."""
     if isinstance(value, (tuple, list)):
@@ -209,9 +226,9 @@ def _path_of(kind: type) -> str:
 def _find(name_or_folder: str | Path) -> Path:
     choices = (Path(name_or_folder) / FILE, SHIPPED / f"planner-{name_or_folder}.json")
     for choice in choices:
-        if choice.is_file():
+        if is_file(choice):
             return choice
-    if Path(name_or_folder).is_dir():
+    if is_folder(Path(name_or_folder)):
         raise InputError(f"folder {str(name_or_folder)!r} holds no planner: no {FILE}, as save_pretrained writes it")
     check_choice("planner", str(name_or_folder), shipped_planners())
     raise AssertionError("a planner that ships was not found")
