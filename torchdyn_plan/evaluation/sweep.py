@@ -32,6 +32,8 @@ class Point(TypedDict):
 
     identity: str
     """Digest of what it is of."""
+    content: str
+    """Digest of the planners' outcomes: a file that was damaged does not have it."""
     planners: dict[str, dict[str, Any]]
     """How each planner's episodes ended."""
 
@@ -178,7 +180,8 @@ class _Sweep:
         for value, repeat in tqdm(missing, desc=f"sweep over {self.over}", unit="point", disable=quiet):
             outcomes = self.study.run(self.points[value], self.seed + repeat)
             planners = {name: episodes.to_json(self.study.task) for name, episodes in outcomes.items()}
-            write_json(self._path(value, repeat), Point(identity=self._digest(value, repeat), planners=planners))
+            point = Point(identity=self._digest(value, repeat), content=digest_of(planners), planners=planners)
+            write_json(self._path(value, repeat), point)
 
     def _all_points(self) -> Iterator[tuple[float, int]]:
         """All values of a repeat before the next repeat, so that an early look at the folder shows the whole range."""
@@ -200,6 +203,8 @@ class _Sweep:
             point: Point = check_content(read_json(path), Point, short_path(path))
             if point["identity"] != self._digest(value, repeat):
                 raise InputError("it is of another sweep, or of another point")
+            if point["content"] != digest_of(point["planners"]):
+                raise InputError("it holds something else than was written")
             return {name: self._outcomes(point, name) for name in self.study.planners}
         except InputError as error:
             raise InputError(f"point {short_path(path)} is damaged ({error}): delete it to run it again") from error

@@ -10,15 +10,24 @@ import math
 import sys
 from collections.abc import Callable, Mapping
 from pathlib import Path
-from typing import Any, Protocol, Self, runtime_checkable
+from typing import Any, Protocol, Self, TypedDict, runtime_checkable
 
 import torch
 from torch import Tensor
 
 from torchdyn_plan.checks import check_choice
 from torchdyn_plan.errors import InputError, WeightsError
-from torchdyn_plan.files import check_writable_folder, is_file, is_folder, write_json, write_whole
+from torchdyn_plan.files import (
+    check_writable_folder,
+    is_file,
+    is_folder,
+    read_json,
+    short_path,
+    write_json,
+    write_whole,
+)
 from torchdyn_plan.nets.pretrained import SHIPPED, Pretrained
+from torchdyn_plan.schemas import check_content
 from torchdyn_plan.versions import library_versions
 
 FORMAT = "torchdyn_plan.planner.1"
@@ -89,7 +98,7 @@ class PretrainedPlanner:
         made = {name: parts[name] if name in parts else load.part(name, value) for name, value in described.items()}
         try:
             planner: Any = cls(**made)
-        except (TypeError, InputError) as error:
+        except (TypeError, ValueError, AttributeError, RuntimeError) as error:
             if isinstance(error, InputError) and parts:
                 raise
             raise WeightsError(f"{str(file)!r} describes no planner that can be made: {error}") from error
@@ -176,7 +185,7 @@ class _Loader:
         """The part ``name``; raises `WeightsError` where it cannot be made."""
         try:
             return self.restore(value)
-        except (KeyError, TypeError, ValueError, AttributeError, ImportError) as error:
+        except (KeyError, TypeError, ValueError, AttributeError, ImportError, RuntimeError, OverflowError) as error:
             if isinstance(error, WeightsError):
                 raise WeightsError(f"{name} of {str(self.file)!r}: {error}") from error
             raise WeightsError(f"{name} of {str(self.file)!r} cannot be made: {error!r}") from error
@@ -234,14 +243,18 @@ def _find(name_or_folder: str | Path) -> Path:
     raise AssertionError("a planner that ships was not found")
 
 
+class _Described(TypedDict):
+    """What is read back of ``planner.json``."""
+
+    format: str
+    parts: dict[str, Any]
+
+
 def _read(file: Path) -> dict[str, Any]:
-    try:
-        content = json.loads(file.read_text())
-        if content["format"] != FORMAT or not isinstance(content["parts"], dict):
-            raise KeyError("format")
-    except (OSError, ValueError, KeyError, TypeError) as error:
-        raise WeightsError(f"{str(file)!r} describes no planner of this package: {error!r}") from error
-    return content
+    content = read_json(file, WeightsError)
+    if not isinstance(content, dict) or content.get("format") != FORMAT:
+        raise WeightsError(f"{short_path(file)} describes no planner of this package")
+    return check_content(content, _Described, short_path(file), WeightsError)
 
 
 def _card(content: Mapping[str, Any]) -> str:

@@ -11,14 +11,15 @@ import time
 from collections.abc import Mapping
 from dataclasses import asdict, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, TypedDict
 
 import torch
 
 from torchdyn_plan.checks import check_choice, check_number
 from torchdyn_plan.errors import InputError
-from torchdyn_plan.files import write_whole
+from torchdyn_plan.files import exists, write_whole
 from torchdyn_plan.nets.policy import Actor
+from torchdyn_plan.schemas import Count
 from torchdyn_plan.tasks.task import Task
 from torchdyn_plan.threads import one_thread
 from torchdyn_plan.training.card import write_card
@@ -122,6 +123,23 @@ def fit_policy(
         return training.run(resume, checkpoint_seconds)
 
 
+class Learner(TypedDict):
+    """Where `DDPG` stands."""
+
+    iteration: Count
+    cursor: Count
+    episode: Count
+
+
+class Progress(TypedDict):
+    """Where a training stands, beside its tensors."""
+
+    curve: list[dict[str, float]]
+    best: dict[str, float]
+    seconds: float
+    ddpg: Learner
+
+
 class _Training:
     def __init__(
         self, task: GoalTask, folder: Path, recipe: DDPGRecipe, *, score_every: int, workers: int, device: str
@@ -139,8 +157,8 @@ class _Training:
         from tqdm import tqdm
 
         tensors, progress = {}, {}
-        if resume and self.file.exists():
-            tensors, progress = read_checkpoint(self.file, settings=self.settings)
+        if resume and exists(self.file):
+            tensors, progress = read_checkpoint(self.file, settings=self.settings, schema=Progress)
         self.ddpg = self.learner()
         self.best_actor = Actor(self.task.policy_config)
         if progress:
@@ -228,14 +246,18 @@ class _TensorBoard:
     def __init__(self, folder: Path, step: int) -> None:
         try:
             from torch.utils.tensorboard import SummaryWriter
-        except ImportError:
-            self.writer = None
-        else:
+
             self.writer = SummaryWriter(str(folder), purge_step=step)
+        except (ImportError, OSError):
+            # A log is no reason to fail, on a full disk neither.
+            self.writer = None
 
     def add(self, figures: dict[str, float], step: int) -> None:
         """Log ``figures`` at ``step``."""
         if self.writer is not None:
-            for name, value in figures.items():
-                self.writer.add_scalar(name, value, step)
-            self.writer.flush()
+            try:
+                for name, value in figures.items():
+                    self.writer.add_scalar(name, value, step)
+                self.writer.flush()
+            except OSError:
+                self.writer = None
