@@ -14,6 +14,10 @@ from torch.func import debug_unwrap
 
 from torchdyn_plan.errors import InputError
 
+LARGEST = 10**18 - 1
+"""No whole number that somebody means is larger."""
+MOST_THREADS = 1024
+
 
 def check_trailing_shape(name: str, tensor: Tensor, *trailing: int) -> None:
     """Raise `InputError` unless ``tensor`` has shape ``(*B, *trailing)``."""
@@ -91,6 +95,8 @@ def check_number(
     name: str, value: float, *, minimum: float = -math.inf, maximum: float = math.inf, integer: bool = False
 ) -> None:
     """Raise `InputError` unless ``value`` is a finite number within ``[minimum, maximum]``."""
+    if isinstance(value, int) and not isinstance(value, bool) and abs(value) > LARGEST:
+        raise InputError(f"{name} must be a number of at most 18 digits, got one of {len(str(abs(value))[:4000])}")
     if isinstance(value, bool) or not isinstance(value, (int, float)) or not math.isfinite(value):
         raise InputError(f"{name} must be a finite number, got {value!r}")
     if integer and not isinstance(value, int):
@@ -100,10 +106,28 @@ def check_number(
         raise InputError(f"{name} must be {bounds}, got {value!r}")
 
 
+def check_count(name: str, value: int, *, minimum: int = 1, maximum: int = 10_000_000) -> None:
+    """Raise `InputError` unless ``value`` is a number of things within ``[minimum, maximum]``."""
+    check_number(name, value, minimum=minimum, integer=True)
+    if value > maximum:
+        raise InputError(f"{name} must be <= {maximum}, got {value}")
+
+
+def check_seed(seed: int) -> None:
+    """Raise `InputError` unless ``seed`` is one from which series of episodes and of draws can be numbered."""
+    check_count("seed", seed, minimum=0, maximum=2**32 - 1)
+
+
+def check_threads(name: str, value: int) -> None:
+    """Raise `InputError` unless ``value`` is a number of threads, or 0 for all cores."""
+    check_count(name, value, minimum=0, maximum=MOST_THREADS)
+
+
 def check_device(device: torch.device | str) -> None:
     """Raise `InputError` unless ``device`` names a device that is here."""
     try:
-        torch.empty(1, device=device)
+        # A device that holds no numbers, as meta, has no item.
+        torch.zeros(1, device=device).item()
     except (RuntimeError, AssertionError) as error:
         reason = str(error).splitlines()[0]
         raise InputError(f"device {str(device)!r} cannot be used: {reason}") from error

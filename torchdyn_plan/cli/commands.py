@@ -22,6 +22,7 @@ from torchdyn_plan.cli.arguments import (
     SweepArguments,
     TrainArguments,
 )
+from torchdyn_plan.cli.output import say
 from torchdyn_plan.errors import InputError
 from torchdyn_plan.tasks import Task
 
@@ -41,9 +42,9 @@ def evaluate(task: Task, arguments: EvaluateArguments) -> None:
 
     task.default_settings(**asdict(arguments.settings))
     found = evaluate(task, arguments.planners, out=arguments.out, **_shared(task, arguments))
-    print(found.table())
+    say(found.table())
     if arguments.out is not None:
-        print(f"\nwritten: {', '.join(str(path) for path in sorted(arguments.out.iterdir()))}")
+        say(f"\nwritten: {', '.join(str(path) for path in sorted(arguments.out.iterdir()))}")
 
 
 def sweep(task: Task, arguments: SweepArguments) -> None:
@@ -60,7 +61,7 @@ def sweep(task: Task, arguments: SweepArguments) -> None:
         repeats=arguments.repeats,
         **_shared(task, arguments),
     )
-    print(format_table(task, rows))
+    say(format_table(task, rows))
 
 
 def collect(task: Task, arguments: CollectArguments) -> None:
@@ -127,7 +128,7 @@ def _print_row(row: Mapping[str, Any]) -> None:
     from tqdm import tqdm
 
     with tqdm.external_write_mode(file=sys.stdout):
-        print("  ".join(f"{name} {_short(value)}" for name, value in row.items()), flush=True)
+        say("  ".join(f"{name} {_short(value)}" for name, value in row.items()))
 
 
 def _short(value: Any) -> str:
@@ -164,8 +165,11 @@ def _delivery(task: Task, arguments: EpisodeArguments) -> Delivery | None:
     from torchdyn_plan.checks import check_number
     from torchdyn_plan.planners import Delayed
 
-    check_number("latency_ms", arguments.latency_ms, minimum=0.0)
     step_ms = 1000 * task.control_step
+    check_number("latency_ms", arguments.latency_ms, minimum=0.0)
+    if arguments.latency_ms > step_ms * task.max_steps:
+        longest = f"an episode of {task.name}, {step_ms * task.max_steps:g} ms"
+        raise InputError(f"latency_ms must be no longer than {longest}, got {arguments.latency_ms:g}")
     steps = round(arguments.latency_ms / step_ms)
     # A millionth of a step is rounding.
     if abs(arguments.latency_ms / step_ms - steps) > 1e-6:

@@ -30,6 +30,14 @@ FITTED = {
 """Networks that are fitted to data, and what ``--help`` says of them."""
 
 
+def check_words(words: Sequence[str]) -> None:
+    """Raise `InputError` for an option that is given nothing: an empty folder would be the one that one is in."""
+    for before, word in zip(("", *words), words, strict=False):
+        if not word.strip() or (word.startswith("--") and word.endswith("=")):
+            option = word.rstrip("=") if word.strip() else before
+            raise InputError(f"{option or 'a word'} is given nothing")
+
+
 def task_of(words: Sequence[str]) -> tuple[str, list[str]]:
     """The task that ``--task NAME`` or ``--task=NAME`` names, the last of several, and the other words."""
     name, others, rest = DEFAULT, [], iter(words)

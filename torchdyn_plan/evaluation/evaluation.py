@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from torchdyn_plan.checks import check_number
+from torchdyn_plan.checks import check_seed
 from torchdyn_plan.evaluation.identity import check_evaluation_folder, clear_results
 from torchdyn_plan.evaluation.plots import plot_results
 from torchdyn_plan.evaluation.report import format_table
@@ -100,7 +100,7 @@ def evaluate(
     """
     task = load_task(task)
     chosen = task.default_settings(**settings)
-    check_number("seed", seed, minimum=0, integer=True)
+    check_seed(seed)
     study = Study.of(
         task,
         planners,

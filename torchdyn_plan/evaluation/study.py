@@ -9,7 +9,7 @@ from functools import cached_property
 from pathlib import Path
 from typing import Any
 
-from torchdyn_plan.checks import check_choice, check_number
+from torchdyn_plan.checks import check_choice, check_count, check_threads
 from torchdyn_plan.errors import InputError
 from torchdyn_plan.evaluation.episodes import Planner, find_truth, run_episodes
 from torchdyn_plan.evaluation.results import EpisodeOutcomes, ResultRow, summarize
@@ -41,9 +41,9 @@ class Study:
     progress: bool = True
 
     def __post_init__(self) -> None:
-        check_number("episodes", self.episodes, minimum=1, integer=True)
-        check_number("num_envs", self.num_envs, minimum=1, integer=True)
-        check_number("num_threads", self.num_threads, minimum=0, integer=True)
+        check_count("episodes", self.episodes)
+        check_count("num_envs", self.num_envs)
+        check_threads("num_threads", self.num_threads)
         check_choice("split", self.split, SPLITS)
 
     @classmethod

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, TypedDict
 
-from torchdyn_plan.checks import check_choice, check_number
+from torchdyn_plan.checks import check_choice, check_count, check_seed
 from torchdyn_plan.errors import InputError
 from torchdyn_plan.evaluation.identity import (
     POINTS,
@@ -23,6 +23,7 @@ from torchdyn_plan.evaluation.results import EpisodeOutcomes, ResultRow, write_r
 from torchdyn_plan.evaluation.study import Planners, Study
 from torchdyn_plan.files import check_writable_folder, exists, read_json, short_path, write_json
 from torchdyn_plan.planners import Delivery
+from torchdyn_plan.progress import progress_bar
 from torchdyn_plan.schemas import check_content
 from torchdyn_plan.tasks.task import Settings, Task, load_task
 
@@ -94,8 +95,8 @@ def sweep(
     """
     task = load_task(task)
     check_choice(f"setting of {task.name} to sweep over", over, sweepable(task))
-    check_number("repeats", repeats, minimum=1, integer=True)
-    check_number("seed", seed, minimum=0, integer=True)
+    check_count("repeats", repeats, maximum=100_000)
+    check_seed(seed)
     base = task.default_settings(**settings)
     study = Study.of(
         task,
@@ -173,11 +174,9 @@ class _Sweep:
         return digest_of(self._identity() | {self.over: value, "seed": self.seed + repeat})
 
     def _run_missing_points(self) -> None:
-        from tqdm import tqdm
-
         missing = [point for point in self._all_points() if not exists(self._path(*point))]
         quiet = not (missing and self.study.progress)
-        for value, repeat in tqdm(missing, desc=f"sweep over {self.over}", unit="point", disable=quiet):
+        for value, repeat in progress_bar(missing, desc=f"sweep over {self.over}", unit="point", disable=quiet):
             outcomes = self.study.run(self.points[value], self.seed + repeat)
             planners = {name: episodes.to_json(self.study.task) for name, episodes in outcomes.items()}
             point = Point(identity=self._digest(value, repeat), content=digest_of(planners), planners=planners)

@@ -13,11 +13,12 @@ from safetensors import SafetensorError, safe_open
 from safetensors.torch import save_file
 from torch import Tensor
 
-from torchdyn_plan.checks import check_choice, check_number
+from torchdyn_plan.checks import check_choice, check_count, check_seed, check_threads
 from torchdyn_plan.errors import InputError
 from torchdyn_plan.files import write_json, write_whole
 from torchdyn_plan.nets.policy import Actor
 from torchdyn_plan.planners import PolicyPlanner, StaticPlanner
+from torchdyn_plan.progress import progress_bar
 from torchdyn_plan.tasks.task import Task, load_task
 from torchdyn_plan.threads import one_thread
 from torchdyn_plan.versions import library_versions
@@ -68,8 +69,6 @@ def collect(
         WeightsError: there are no such weights.
         OutputError: the folder cannot be written to.
     """
-    from tqdm import tqdm
-
     task = load_task(task)
     check_choice("kind of data", what, SHARD)
     if weights is not None and (what != "arrivals" or planner is not None):
@@ -79,7 +78,7 @@ def collect(
     wanted = _Wanted(task.name, what, str(out), episodes, seed, num_envs, num_threads, driver, file)
     with one_thread():
         record = _recorder(task, wanted, planner)
-        for index in tqdm(range(wanted.shards), desc=f"collect {what}", unit="shard"):
+        for index in progress_bar(range(wanted.shards), desc=f"collect {what}", unit="shard"):
             path = out / f"{what}-{seed}-{index:03d}.safetensors"
             made = wanted.metadata(index, task.digest())
             if path.exists() and _is_kept(path, made):
@@ -105,8 +104,10 @@ class _Wanted:
     weights: str | None = None
 
     def __post_init__(self) -> None:
-        for name, minimum in (("episodes", 1), ("num_envs", 1), ("seed", 0), ("num_threads", 0)):
-            check_number(name, getattr(self, name), minimum=minimum, integer=True)
+        check_count("episodes", self.episodes)
+        check_count("num_envs", self.num_envs)
+        check_seed(self.seed)
+        check_threads("num_threads", self.num_threads)
 
     @property
     def shards(self) -> int:

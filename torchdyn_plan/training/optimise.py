@@ -10,10 +10,12 @@ from typing import Any, TypedDict
 import torch
 from torch import Tensor, nn
 
-from torchdyn_plan.checks import check_device, check_number
+from torchdyn_plan.checks import check_device, check_number, check_seed
 from torchdyn_plan.errors import TrainingError
 from torchdyn_plan.files import exists, write_json
+from torchdyn_plan.progress import progress_bar
 from torchdyn_plan.schemas import Count
+from torchdyn_plan.stopping import stop_when_safe
 from torchdyn_plan.training.checkpoint import load_checkpoint, save_checkpoint
 
 
@@ -45,7 +47,7 @@ class Recipe:
     def __post_init__(self) -> None:
         for name in ("steps", "batch", "validations"):
             check_number(name, getattr(self, name), minimum=1, integer=True)
-        check_number("seed", self.seed, minimum=0, integer=True)
+        check_seed(self.seed)
         check_number("lr", self.lr, minimum=1e-9)
         check_number("clip", self.clip, minimum=1e-9)
         check_number("warmup_share", self.warmup_share, minimum=0.0, maximum=1.0)
@@ -129,19 +131,18 @@ class _Descent:
         self.step, self.total, self.counted, self.curve = 0, 0.0, 0, []
 
     def run(self, resume: bool) -> list[dict[str, float]]:
-        from tqdm import tqdm
-
         if resume and exists(self.file):
             self.restore()
         saved = time.monotonic()
-        with tqdm(total=self.recipe.steps, initial=self.step, desc=f"fit {self.file.parent.name}", unit="step") as bar:
-            while self.step < self.recipe.steps:
+        about: Any = {"total": self.recipe.steps, "initial": self.step, "desc": f"fit {self.file.parent.name}"}
+        with stop_when_safe() as stopping, progress_bar(unit="step", **about) as bar:
+            while self.step < self.recipe.steps and not stopping():
                 self.advance()
                 bar.update()
                 if self.recipe.is_validated(self.step):
                     self.record()
                     bar.set_postfix({name: f"{value:.4g}" for name, value in self.curve[-1].items() if name != "step"})
-                elif time.monotonic() - saved < self.recipe.checkpoint_seconds:
+                elif not stopping() and time.monotonic() - saved < self.recipe.checkpoint_seconds:
                     continue
                 self.save()
                 saved = time.monotonic()

@@ -15,11 +15,13 @@ from typing import Any, TypedDict
 
 import torch
 
-from torchdyn_plan.checks import check_choice, check_number
+from torchdyn_plan.checks import MOST_THREADS, check_choice, check_count, check_number, check_threads
 from torchdyn_plan.errors import InputError
 from torchdyn_plan.files import exists, write_whole
 from torchdyn_plan.nets.policy import Actor
+from torchdyn_plan.progress import progress_bar
 from torchdyn_plan.schemas import Count
+from torchdyn_plan.stopping import stop_when_safe
 from torchdyn_plan.tasks.task import Task
 from torchdyn_plan.threads import one_thread
 from torchdyn_plan.training.card import write_card
@@ -62,6 +64,8 @@ def train_policy(
     check_choice(f"policy of {task.name}", name, task.policies)
     training = task.policies[name]
     options = training.options() if options is None else options
+    check_threads("num_threads", num_threads)
+    check_count("workers", workers, minimum=0, maximum=MOST_THREADS)
     if not isinstance(options, training.options):
         raise InputError(f"options of {name} must be {training.options.__name__}, got {type(options).__name__}")
     recipe: DDPGRecipe = training.recipe()
@@ -154,8 +158,6 @@ class _Training:
         self.seconds = 0.0
 
     def run(self, resume: bool, checkpoint_seconds: float) -> Path:
-        from tqdm import tqdm
-
         tensors, progress = {}, {}
         if resume and exists(self.file):
             tensors, progress = read_checkpoint(self.file, settings=self.settings, schema=Progress)
@@ -166,15 +168,16 @@ class _Training:
         log = _TensorBoard(self.folder, self.ddpg.iteration)
         saved = started = time.monotonic()
         rounds = self.recipe.iterations
-        with tqdm(total=rounds, initial=self.ddpg.iteration, desc="fit policy", unit="round") as bar:
-            while self.ddpg.iteration < rounds:
+        about: Any = {"total": rounds, "initial": self.ddpg.iteration, "desc": "fit policy", "unit": "round"}
+        with stop_when_safe() as stopping, progress_bar(**about) as bar:
+            while self.ddpg.iteration < rounds and not stopping():
                 figures = self.ddpg.iterate()
                 bar.update()
                 scored = self.ddpg.iteration % self.score_every == 0 or self.ddpg.iteration == rounds
                 if scored:
                     self.seconds, started = self.seconds + time.monotonic() - started, time.monotonic()
                     bar.set_postfix({name: f"{value:.3g}" for name, value in self.score(figures, log).items()})
-                if scored or time.monotonic() - saved > checkpoint_seconds:
+                if scored or stopping() or time.monotonic() - saved > checkpoint_seconds:
                     self.seconds, started = self.seconds + time.monotonic() - started, time.monotonic()
                     self.save()
                     saved = time.monotonic()

@@ -20,6 +20,7 @@ from torchdyn_plan.envs.trapper.simulation import TrapperSimulation
 from torchdyn_plan.envs.trapper.starts import draw_starts
 from torchdyn_plan.errors import OutputError, WeightsError
 from torchdyn_plan.files import read_tensors, write_tensors
+from torchdyn_plan.progress import progress_bar
 from torchdyn_plan.tasks.task import Truth
 from torchdyn_plan.tasks.trapper.task import TASK
 
@@ -109,15 +110,13 @@ def measure_arrivals(
     planner: Callable[[TensorDictBase], TensorDictBase], scene: TrapperScene, *, num_threads: int = 0
 ) -> ArrivalMap:
     """Run ``planner`` from home to every point of a grid over the table, and look when it is there."""
-    from tqdm import tqdm
-
     count = int(-(-scene.table_side // SPACING)) + 1
     line = torch.linspace(-scene.half_side, scene.half_side, count)
     grid = torch.cartesian_prod(line, line)
     goals = torch.cat([grid, torch.full((len(grid), 1), scene.ball_radius)], dim=-1)
     arms = TrapperArmRunner(planner, len(goals), scene=scene, num_threads=num_threads)
     arrived = torch.full((len(goals),), NEVER)
-    for step in tqdm(range(LONGEST + 1), desc="measure arrivals", unit="step", leave=False):
+    for step in progress_bar(range(LONGEST + 1), desc="measure arrivals", unit="step", leave=False):
         arrived = torch.where((arrived == NEVER) & arms.is_reached(goals), step, arrived)
         arms.step(goals)
     return ArrivalMap(arrived.view(count, count), scene.half_side)
