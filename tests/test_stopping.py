@@ -12,22 +12,32 @@ from torchdyn_plan.stopping import Terminated, stop_when_safe, terminable
 @pytest.mark.parametrize(("number", "error"), [(signal.SIGINT, KeyboardInterrupt), (signal.SIGTERM, Terminated)])
 def test_a_signal_waits_until_it_is_safe(number, error):
     done = []
+
+    def work():
+        with terminable(), stop_when_safe() as stopping:
+            for step in range(5):
+                if step == 2:
+                    os.kill(os.getpid(), number)
+                done.append(stopping())
+
     before = signal.getsignal(signal.SIGTERM)
-    with terminable(), pytest.raises(error), stop_when_safe() as stopping:
-        for step in range(5):
-            if step == 2:
-                os.kill(os.getpid(), number)
-            done.append(stopping())
+    with pytest.raises(error):
+        work()
     assert done == [False, False, True, True, True]
     assert signal.getsignal(signal.SIGTERM) == before
 
 
 def test_a_second_signal_does_not_wait():
     done = []
-    with pytest.raises(KeyboardInterrupt), stop_when_safe():
-        for _ in range(3):
-            os.kill(os.getpid(), signal.SIGINT)
-            done.append("step")
+
+    def work():
+        with stop_when_safe():
+            for _ in range(3):
+                os.kill(os.getpid(), signal.SIGINT)
+                done.append("step")
+
+    with pytest.raises(KeyboardInterrupt):
+        work()
     assert done == ["step"]
 
 
