@@ -218,6 +218,10 @@ BAD = [
     (["collect", "arrivals", "--static", "kuka", "--out", "{out}"], "unknown static planner of trapper 'kuka'"),
     (["collect", "arrivals", "--weights", "{new}", "--out", "{out}"], "no weights '{new}'"),
     (["train", "dher"], "unknown network of trapper 'dher'; choose from eta, forecaster, policy, spread"),
+    (["train", "eta", "--static", "kuka", "--out", "{new}"], "unknown static planner of trapper 'kuka'"),
+    (["train", "eta"], "no arrivals-*.json in 'runs/data/trapper-ik'"),
+    (["train", "eta", "--static", "rl"], "no arrivals-*.json in 'runs/data/trapper-rl'"),
+    (["train", "forecaster", "--task", "fetch_reach"], "no paths-*.json in 'runs/data/fetch_reach-proportional'"),
     (["train", "eta", "--data", "{new}", "--out", "{out}"], "no arrivals-*.json in '{new}'"),
     (["train", "forecaster", "--data", "{new}", "--out", "{out}"], "no paths-*.json in '{new}'"),
     (["train", "spread", "--task", "fetch_reach", "--out", "{out}"], "fetch_reach"),
@@ -263,6 +267,7 @@ def test_a_mistake_is_told_in_one_line(words, message, tmp_path, capsys, monkeyp
     assert places["file"].read_text() == "in the way"
     assert not places["new"].exists(), "an empty folder is left"
     assert not places["out"].exists(), "an empty folder is left"
+    assert not (tmp_path / "runs").exists(), "an empty folder is left"
 
 
 @pytest.mark.parametrize("words", [["evaluat"], ["evaluate", "--episode"], ["evaluate", "--velocity", "fast"], []])

@@ -14,7 +14,7 @@ import tempfile
 import time
 from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, BinaryIO
 
 from torchdyn_plan.errors import InputError, OutputError, TorchdynPlanError
 
@@ -37,6 +37,8 @@ def write_whole(path: Path, write: Callable[[Path], object]) -> None:
     """
     from safetensors import SafetensorError
 
+    if "\0" in str(path):
+        raise OutputError(f"cannot write {short_path(path)}: no name has a null in it")
     try:
         with no_empty_folders(path.parent), _workplace(path.parent) as (place, mode):
             temporary = place / path.name
@@ -134,7 +136,7 @@ def check_writable_folder(folder: Path) -> Path:
     try:
         with no_empty_folders(folder), _workplace(folder) as (place, _):
             (place / "probe").write_bytes(b"x")
-    except OSError as error:
+    except (OSError, ValueError) as error:
         raise OutputError(f"output folder {short_path(folder)} is not writable: {reason(error)}") from error
     return folder
 
@@ -170,13 +172,27 @@ def _workplace(folder: Path) -> Iterator[tuple[Path, int]]:
     """A new folder within ``folder``, which is made if needed, and the mode that files get; it is gone afterwards."""
     folder.mkdir(parents=True, exist_ok=True)
     _tidy(folder)
-    place = Path(tempfile.mkdtemp(prefix=TEMPORARY, dir=folder))
+    place, lock = _locked_folder(folder)
     try:
-        with (place / LOCK).open("wb") as lock:
-            _take(lock.fileno())
-            yield place, os.fstat(lock.fileno()).st_mode & 0o777
+        yield place, os.fstat(lock.fileno()).st_mode & 0o777
     finally:
+        lock.close()
         shutil.rmtree(place, ignore_errors=True)
+
+
+def _locked_folder(folder: Path) -> tuple[Path, BinaryIO]:
+    """A new folder within ``folder``, and the lock that is held on it."""
+    while True:
+        place = Path(tempfile.mkdtemp(prefix=TEMPORARY, dir=folder))
+        try:
+            lock = (place / LOCK).open("wb")
+        except BaseException:
+            shutil.rmtree(place, ignore_errors=True)
+            raise
+        # Who tidies up may have come before the lock, and takes the folder for one that was left.
+        if _take(lock) is not False and (place / LOCK).exists():
+            return place, lock
+        lock.close()
 
 
 def _tidy(folder: Path) -> None:
@@ -195,19 +211,21 @@ def _is_left(place: Path) -> bool:
     if not (place / LOCK).exists():
         return time.time() - place.stat().st_mtime > SOON
     with (place / LOCK).open("rb+") as lock:
-        return _take(lock.fileno())
+        return _take(lock) is True
 
 
-def _take(lock: int) -> bool:
-    """Lock the open file ``lock`` until it is closed; whether nobody else had it. Where there are no locks, no."""
+def _take(lock: BinaryIO) -> bool | None:
+    """Lock an open file until it is closed: whether nobody else had it, or None where there are no locks."""
     try:
         import fcntl
     except ImportError:
-        return False
+        return None
     try:
-        fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
-    except OSError:
+        fcntl.flock(lock.fileno(), fcntl.LOCK_EX | fcntl.LOCK_NB)
+    except BlockingIOError:
         return False
+    except OSError:
+        return None
     return True
 
 

@@ -79,6 +79,7 @@ def _run(words: Sequence[str]) -> None:
         network = _network(task.name, networks, others[1:])
         about = {"prog": f"{PROGRAM} train", "description": f"Train a network of {task.name}.", "args": others[1:]}
         parsed: Any = tyro.extras.subcommand_cli_from_dict(networks, **about)
+        parsed = commands.with_folders(task, parsed)
         with _unless_in_vain(parsed):
             commands.train(task, network, parsed)
         return
@@ -92,7 +93,7 @@ def _run(words: Sequence[str]) -> None:
         return
     choices: dict[str, Any] = {**forms.command_forms(task, named), "bench": BenchArguments, "train": TrainArguments}
     about = {"prog": PROGRAM, "description": "Planners for static targets, made to meet moving ones.", "args": others}
-    parsed = tyro.extras.subcommand_cli_from_dict(choices, **about)
+    parsed = commands.with_folders(task, tyro.extras.subcommand_cli_from_dict(choices, **about))
     with _unless_in_vain(parsed):
         commands.run(task, parsed)
 

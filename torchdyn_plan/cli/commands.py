@@ -5,12 +5,13 @@ from __future__ import annotations
 import importlib
 import sys
 from collections.abc import Callable, Mapping
-from dataclasses import asdict, fields
+from dataclasses import asdict, fields, replace
 from typing import TYPE_CHECKING, Any
 
 from torchdyn_plan.cli.arguments import (
     BENCHMARKS,
     DATA,
+    TRAINING,
     Arguments,
     BenchArguments,
     CollectArguments,
@@ -21,6 +22,7 @@ from torchdyn_plan.cli.arguments import (
     ReplanArguments,
     SweepArguments,
     TrainArguments,
+    default_folder,
 )
 from torchdyn_plan.cli.output import say
 from torchdyn_plan.errors import InputError
@@ -34,6 +36,24 @@ def run(task: Task | None, arguments: Arguments) -> None:
     """Run the command that takes these arguments; benchmarks may be given no task."""
     command = next(function for form, function in COMMANDS.items() if isinstance(arguments, form))
     command(task, arguments)
+
+
+def with_folders(task: Task, arguments: Any) -> Any:
+    """``arguments`` with the folders that they leave open."""
+    from torchdyn_plan.checks import check_choice
+
+    if isinstance(arguments, (CollectArguments, FitArguments)) and arguments.static:
+        check_choice(f"static planner of {task.name}", arguments.static, task.static_planners)
+    if isinstance(arguments, CollectArguments):
+        static = arguments.static or task.default_static
+        return replace(arguments, out=arguments.out or default_folder(DATA, task.name, static))
+    if isinstance(arguments, FitArguments):
+        static = arguments.static or task.default_static
+        data = arguments.data or default_folder(DATA, task.name, static)
+        return replace(arguments, data=data, out=arguments.out or default_folder(TRAINING, task.name, static))
+    if isinstance(arguments, TrainArguments):
+        return replace(arguments, out=arguments.out or default_folder(TRAINING, task.name))
+    return arguments
 
 
 def evaluate(task: Task, arguments: EvaluateArguments) -> None:
@@ -67,9 +87,10 @@ def sweep(task: Task, arguments: SweepArguments) -> None:
 def collect(task: Task, arguments: CollectArguments) -> None:
     """Gather the data."""
     from torchdyn_plan.files import check_writable_folder
-
-    check_writable_folder(arguments.out)
     from torchdyn_plan.training.collect import collect
+
+    assert arguments.out is not None
+    check_writable_folder(arguments.out)
 
     collect(
         task,
@@ -87,18 +108,24 @@ def collect(task: Task, arguments: CollectArguments) -> None:
 def train(task: Task, network: str, arguments: TrainArguments) -> None:
     """Train the network, or go on where its folder stands."""
     from torchdyn_plan.files import check_writable_folder
-
-    check_writable_folder(arguments.out)
     from torchdyn_plan.training.train import train
+
+    assert arguments.out is not None
+    check_writable_folder(arguments.out)
+    data = arguments.out
 
     own: dict[str, Any] = {}
     if isinstance(arguments, PolicyArguments):
         own["options"] = task.policies[network].options(**asdict(arguments.training))
         own |= {"num_envs": arguments.num_envs, "num_threads": arguments.threads, "workers": arguments.workers}
+    elif isinstance(arguments, FitArguments):
+        assert arguments.data is not None
+        data = arguments.data
+        own["static"] = arguments.static
     train(
         task,
         network,
-        arguments.data if isinstance(arguments, FitArguments) else DATA,
+        data,
         arguments.out,
         steps=arguments.steps,
         batch=arguments.batch,

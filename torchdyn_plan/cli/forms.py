@@ -90,7 +90,14 @@ def train_forms(task: Task, named: str) -> dict[str, type[Arguments]]:
     from torchdyn_plan.training.train import networks
 
     fitted = [network for network in networks(task) if network not in task.policies]
-    forms = {network: _form(FitArguments, FITTED[network], task=_task_option(named)) for network in fitted}
+    static = _option(
+        str | None,
+        f"Static planner whose arrivals are learned, {task.default_static} when not given; folders carry its name.",
+        choices=task.static_planners,
+        default=None,
+    )
+    shared = {"task": _task_option(named), "static": static}
+    forms = {network: _form(FitArguments, FITTED[network], **shared) for network in fitted}
     for name, training in task.policies.items():
         options = _group(_plain(training.options))
         forms[name] = _form(PolicyArguments, training.summary, task=_task_option(named), training=options)

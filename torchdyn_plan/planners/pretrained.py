@@ -21,6 +21,7 @@ from torchdyn_plan.files import (
     check_writable_folder,
     is_file,
     is_folder,
+    no_empty_folders,
     read_json,
     short_path,
     write_json,
@@ -56,19 +57,11 @@ class PretrainedPlanner:
         Returns:
             The JSON file. Raises `OutputError` where it cannot be written.
         """
-        folder = check_writable_folder(Path(folder))
-        written: dict[int, str] = {}
-
-        def save(network: Pretrained) -> str:
-            if id(network) not in written:
-                count = sum(name.startswith(network.kind) for name in written.values())
-                written[id(network)] = f"{network.kind}{count + 1 if count else ''}.safetensors"
-                network.save_pretrained(folder / written[id(network)])
-            return written[id(network)]
-
-        content = describe_planner(self, save)
-        write_json(folder / FILE, content)
-        write_whole(folder / "planner.md", lambda file: file.write_text(_card(content)))
+        folder, written = Path(folder), {}
+        with no_empty_folders(folder):
+            content = describe_planner(self, lambda network: _save(network, check_writable_folder(folder), written))
+            write_json(folder / FILE, content)
+            write_whole(folder / "planner.md", lambda file: file.write_text(_card(content), encoding="utf-8"))
         return folder / FILE
 
     @classmethod
@@ -103,6 +96,16 @@ class PretrainedPlanner:
                 raise
             raise WeightsError(f"{str(file)!r} describes no planner that can be made: {error}") from error
         return _ready(planner.to(device), parts)
+
+
+def _save(network: Pretrained, folder: Path, written: dict[int, str]) -> str:
+    """Write ``network`` into ``folder`` unless it was ``written`` already; returns the name of its file."""
+    if id(network) not in written:
+        count = sum(name.startswith(network.kind) for name in written.values())
+        name = f"{network.kind}{count + 1 if count else ''}.safetensors"
+        network.save_pretrained(folder / name)
+        written[id(network)] = name
+    return written[id(network)]
 
 
 def shipped_planners() -> list[str]:
