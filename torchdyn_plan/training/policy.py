@@ -16,8 +16,8 @@ from typing import Any, TypedDict
 import torch
 
 from torchdyn_plan.checks import MOST_THREADS, check_choice, check_count, check_number, check_threads
-from torchdyn_plan.errors import InputError
-from torchdyn_plan.files import exists, write_whole
+from torchdyn_plan.errors import InputError, TrainingError
+from torchdyn_plan.files import exists, short_path, write_whole
 from torchdyn_plan.nets.policy import Actor
 from torchdyn_plan.progress import progress_bar
 from torchdyn_plan.schemas import Count
@@ -216,8 +216,11 @@ class _Training:
         write_checkpoint(self.file, tensors, settings=self.settings, progress=progress)
 
     def restore(self, tensors: dict[str, torch.Tensor], progress: dict[str, Any]) -> None:
-        self.ddpg.restore(tensors, progress["ddpg"])
-        self.best_actor.load_state_dict(group(tensors, "best"))
+        try:
+            self.ddpg.restore(tensors, progress["ddpg"])
+            self.best_actor.load_state_dict(group(tensors, "best"))
+        except (KeyError, ValueError, TypeError, RuntimeError, IndexError, StopIteration) as error:
+            raise TrainingError(f"checkpoint {short_path(self.file)} does not fit: {error!r}") from error
         self.curve, self.best, self.seconds = progress["curve"], progress["best"], progress["seconds"]
 
     def write_card(self) -> None:
