@@ -9,7 +9,7 @@ export UV_PYTHON_DOWNLOADS ?= never
 .PHONY: demo test check lock environment clean
 
 demo: environment
-	$(BIN)/torchdyn-plan evaluate --static ik --planners pursuit corner oracle wait_and_drop --velocity 3 --episodes 100 --seed 0 --out runs/demo
+	$(BIN)/torchdyn-plan evaluate --static ik --planners pursuit corner oracle wait_and_drop --velocity 3 --episodes 100 --seed 0 --out runs/demo --overwrite
 
 # One thread a worker: two pools of threads on the same cores slow each other down.
 test: environment

@@ -5,6 +5,7 @@ import torch
 
 from torchdyn_plan import checks
 from torchdyn_plan.errors import InputError, OutputError, TorchdynPlanError
+from torchdyn_plan.files import check_writable_folder
 
 
 def test_trailing_shape_lets_any_batch_through():
@@ -67,7 +68,7 @@ def test_bounds_are_told():
 
 
 def test_a_writable_folder_is_made_and_left_empty(tmp_path):
-    folder = checks.check_writable_folder(tmp_path / "a" / "b")
+    folder = check_writable_folder(tmp_path / "a" / "b")
     assert folder.is_dir()
     assert list(folder.iterdir()) == []
 
@@ -76,7 +77,7 @@ def test_a_file_is_no_folder(tmp_path):
     (tmp_path / "file").write_text("here first")
     for folder in (tmp_path / "file", tmp_path / "file" / "below"):
         with pytest.raises(OutputError, match="is not writable") as caught:
-            checks.check_writable_folder(folder)
+            check_writable_folder(folder)
         assert str(folder) in str(caught.value)
 
 

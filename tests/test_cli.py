@@ -1,14 +1,17 @@
 import dataclasses
 import json
 import os
+import signal
 import subprocess
 import sys
+from importlib.util import find_spec
 from pathlib import Path
 
 import pytest
 import torch
 
 from torchdyn_plan import cli, tasks
+from torchdyn_plan.cli.output import say
 from torchdyn_plan.envs import TrapperEnv, TrapperScene
 from torchdyn_plan.evaluation.results import NO_CAUSE, EpisodeOutcomes
 from torchdyn_plan.evaluation.study import Study
@@ -90,8 +93,9 @@ def test_the_installed_command_is_this_one():
     assert entry.load() is cli.main
 
 
-def test_the_package_runs_as_a_module():
-    run = [sys.executable, "-m", "torchdyn_plan", "--help"]
+@pytest.mark.parametrize("module", ["torchdyn_plan", "torchdyn_plan.cli"])
+def test_the_package_runs_as_a_module(module):
+    run = [sys.executable, "-m", module, "--help"]
     done = subprocess.run(run, capture_output=True, text=True, check=True)
     assert "usage: torchdyn-plan" in done.stdout
     assert done.stderr == ""
@@ -148,6 +152,7 @@ def test_each_benchmark_shows_its_own_options_alone(capsys):
     assert all(name in helped(["bench"], capsys) for name in ("replan", "env", "kinematics"))
 
 
+HUGE = "1" * 30
 BAD = [
     (["evaluate", "--planners", "pursit"], "unknown planner of trapper 'pursit' (did you mean 'pursuit'?)"),
     (["evaluate", "--planners", "pursuit", "pursuit"], "planners must be named once each"),
@@ -162,7 +167,7 @@ BAD = [
     (["evaluate", "--split", "tets"], "unknown split 'tets' (did you mean 'test'?)"),
     (["evaluate", "--velocity", "-1"], "velocity must be in [0, 20], got -1.0"),
     (["evaluate", "--velocity", "nan"], "velocity must be a finite number, got nan"),
-    (["evaluate", "--friction", "-0.5"], "friction must be >= 0, got -0.5"),
+    (["evaluate", "--friction", "-0.5"], "friction must be in [0, 1000], got -0.5"),
     (["evaluate", "--latency-ms", "10"], "latency_ms must be whole control steps of 4 ms, got 10"),
     (["evaluate", "--task", "fetch_reach", "--latency-ms", "20"], "latency_ms must be whole control steps of 40 ms"),
     (["evaluate", "--latency-ms", "-4"], "latency_ms must be >= 0, got -4.0"),
@@ -171,11 +176,43 @@ BAD = [
     (["evaluate", "--seed", "-1"], "seed must be >= 0, got -1"),
     (["evaluate", "--out", "{file}"], "output folder '{file}' is not writable: File exists"),
     (["evaluate", "--out", "{file}/below"], "output folder '{file}/below' is not writable: Not a directory"),
+    (["evaluate", "--out", ""], "--out is given nothing"),
+    (["evaluate", "--out="], "--out is given nothing"),
+    (["sweep", "--over", "velocity", "--out", ""], "--out is given nothing"),
+    (["evaluate", "--latency-ms", "1e9"], "latency_ms must be no longer than an episode of trapper, 2000 ms"),
+    (["evaluate", "--episodes", HUGE], "episodes must be a number of at most 18 digits, got one of 30"),
+    (["evaluate", "--episodes", "1" * 12], "episodes must be <= 10000000"),
+    (["evaluate", "--seed", HUGE], "seed must be a number of at most 18 digits"),
+    (["evaluate", "--num-envs", HUGE], "num_envs must be a number of at most 18 digits"),
+    (["evaluate", "--threads", HUGE], "num_threads must be a number of at most 18 digits"),
+    (["evaluate", "--threads", "9999999"], "num_threads must be <= 1024"),
+    (["evaluate", "--velocity", HUGE], "velocity must be in [0, 20]"),
+    (["evaluate", "--friction", HUGE], "friction must be in [0, 1000]"),
+    (["evaluate", "--latency-ms", HUGE], "latency_ms must be no longer than"),
+    (["evaluate", "--weights", "x" * 300], "no weights 'xxx"),
+    (["evaluate", "--out", "x" * 300], "output folder 'xxx"),
+    (["sweep", "--over", "velocity", "--out", "{new}", "--repeats", HUGE], "repeats must be a number of at most"),
+    (["sweep", "--over", "friction", "--out", "{new}", "--values", "1e30"], "friction must be in [0, 1000]"),
+    (["collect", "paths", "--out", "{new}", "--episodes", HUGE], "episodes must be a number of at most"),
+    (["collect", "paths", "--out", "{new}", "--seed", HUGE], "seed must be a number of at most"),
+    (["collect", "paths", "--out", "{new}", "--threads", HUGE], "num_threads must be a number of at most"),
+    (["train", "eta", "--steps", HUGE, "--out", "{new}"], "steps must be a number of at most"),
+    (["train", "eta", "--seed", HUGE, "--out", "{new}"], "seed must be a number of at most"),
+    (["train", "eta", "--device", "meta", "--out", "{new}"], "device 'meta' cannot be used"),
+    (["train", "policy", "--device", "meta", "--out", "{new}"], "device 'meta' cannot be used"),
+    (["train", "policy", "--threads", HUGE, "--out", "{new}"], "num_threads must be a number of at most"),
+    (["train", "policy", "--num-envs", HUGE, "--out", "{new}"], "num_envs must be a number of at most"),
+    (["train", "policy", "--workers", HUGE, "--out", "{new}"], "workers must be a number of at most"),
+    (["train", "policy", "--period", HUGE, "--out", "{new}"], "period must be a number of at most"),
+    (["bench", "replan", "--device", "meta"], "device 'meta' cannot be used"),
+    (["bench", "replan", "--batches", HUGE], "batches must be a number of at most"),
+    (["bench", "replan", "--seconds", "1e30"], "seconds must be <= 3600"),
+    (["bench", "env", "--out", "{new}/x.png"], "output file '{new}/x.png' must end in .json"),
     (["sweep", "--over", "velocity", "--out", "{file}"], "output folder '{file}' is not writable"),
     (["sweep", "--over", "speed", "--out", "{new}"], "unknown setting of trapper to sweep over 'speed'"),
     (["sweep", "--over", "velocity", "--out", "{new}", "--values", "1", "nan"], "velocity must be a finite number"),
     (["sweep", "--over", "velocity", "--out", "{new}", "--values", "1", "1"], "values must differ, got 1.0 1.0"),
-    (["sweep", "--over", "friction", "--out", "{new}", "--values", "-1"], "friction must be >= 0"),
+    (["sweep", "--over", "friction", "--out", "{new}", "--values", "-1"], "friction must be in [0, 1000]"),
     (["sweep", "--over", "friction", "--out", "{new}", "--repeats", "0"], "repeats must be >= 1"),
     (["collect", "paths", "--task", "trappr"], "unknown task 'trappr' (did you mean 'trapper'?)"),
     (["collect", "pahts", "--out", "{out}"], "unknown kind of data 'pahts' (did you mean 'paths'?)"),
@@ -183,6 +220,10 @@ BAD = [
     (["collect", "arrivals", "--static", "kuka", "--out", "{out}"], "unknown static planner of trapper 'kuka'"),
     (["collect", "arrivals", "--weights", "{new}", "--out", "{out}"], "no weights '{new}'"),
     (["train", "dher"], "unknown network of trapper 'dher'; choose from eta, forecaster, policy, spread"),
+    (["train", "eta", "--static", "kuka", "--out", "{new}"], "unknown static planner of trapper 'kuka'"),
+    (["train", "eta"], "no arrivals-*.json in 'runs/data/trapper-ik'"),
+    (["train", "eta", "--static", "rl"], "no arrivals-*.json in 'runs/data/trapper-rl'"),
+    (["train", "forecaster", "--task", "fetch_reach"], "no paths-*.json in 'runs/data/fetch_reach-proportional'"),
     (["train", "eta", "--data", "{new}", "--out", "{out}"], "no arrivals-*.json in '{new}'"),
     (["train", "forecaster", "--data", "{new}", "--out", "{out}"], "no paths-*.json in '{new}'"),
     (["train", "spread", "--task", "fetch_reach", "--out", "{out}"], "fetch_reach"),
@@ -219,8 +260,9 @@ BAD = [
 ]
 
 
-@pytest.mark.parametrize(("words", "message"), BAD, ids=[" ".join(words) for words, _ in BAD])
-def test_a_mistake_is_told_in_one_line(words, message, tmp_path, capsys):
+@pytest.mark.parametrize(("words", "message"), BAD, ids=[" ".join(words)[:80] for words, _ in BAD])
+def test_a_mistake_is_told_in_one_line(words, message, tmp_path, capsys, monkeypatch):
+    monkeypatch.chdir(tmp_path)
     places = {"file": tmp_path / "file", "new": tmp_path / "new", "out": tmp_path / "out", "folder": tmp_path}
     places["file"].write_text("in the way")
     code, out, err = answer([word.format(**places) for word in words], capsys)
@@ -229,6 +271,9 @@ def test_a_mistake_is_told_in_one_line(words, message, tmp_path, capsys):
     (line,) = err.splitlines()
     assert line.startswith("torchdyn-plan: error: " + message.format(**places))
     assert places["file"].read_text() == "in the way"
+    assert not places["new"].exists(), "an empty folder is left"
+    assert not places["out"].exists(), "an empty folder is left"
+    assert not (tmp_path / "runs").exists(), "an empty folder is left"
 
 
 @pytest.mark.parametrize("words", [["evaluat"], ["evaluate", "--episode"], ["evaluate", "--velocity", "fast"], []])
@@ -410,3 +455,51 @@ def test_a_terminal_without_our_signs_still_gets_the_table(tmp_path, encoding):
     assert run.returncode == 0, run.stderr
     assert b"pursuit" in run.stdout
     assert (tmp_path / "results.json").is_file()
+
+
+@pytest.mark.skipif(find_spec("ray") is not None, reason="Ray is here")
+def test_workers_without_ray_name_the_extra(tmp_path, capsys):
+    code, _, err = answer(["train", "policy", "--workers", "1", "--num-envs", "2", "--out", tmp_path / "new"], capsys)
+    assert code == 2
+    assert err.splitlines()[-1] == "torchdyn-plan: error: workers need Ray: pip install 'torchdyn-plan[ray]'"
+    assert not (tmp_path / "new").exists()
+
+
+def test_sigterm_ends_like_ctrl_c(tmp_path, monkeypatch, capsys):
+    monkeypatch.setattr(Study, "run", lambda *_: os.kill(os.getpid(), signal.SIGTERM))
+    out = tmp_path / "new"
+    words = ["evaluate", "--planners", "pursuit", "--episodes", "1", "--out", out]
+    before = signal.getsignal(signal.SIGTERM)
+    assert answer(words, capsys) == (143, "", "torchdyn-plan: terminated\n")
+    assert signal.getsignal(signal.SIGTERM) == before
+    assert not out.exists()
+
+
+@pytest.mark.parametrize(
+    ("raised", "told"),
+    [
+        (OSError(28, "No space left on device"), "No space left on device"),
+        (MemoryError(), "not enough memory"),
+        (RuntimeError("[enforce fail] DefaultCPUAllocator: not enough memory: you tried"), "not enough memory"),
+    ],
+)
+def test_a_machine_that_has_not_enough_is_no_traceback(raised, told, monkeypatch, capsys):
+    def run(*_):
+        raise raised
+
+    monkeypatch.setattr(Study, "run", run)
+    code, _, err = answer(["evaluate", "--planners", "pursuit", "--episodes", "1"], capsys)
+    assert code == 2
+    assert told in err
+    assert len(err.splitlines()) == 1
+
+
+def test_a_closed_pipe_does_not_end_a_benchmark(monkeypatch):
+    """What is said goes nowhere from then on; what is measured goes on."""
+    reading, writing = os.pipe()
+    os.close(reading)
+    with os.fdopen(writing, "w") as out:
+        monkeypatch.setattr(sys, "stdout", out)
+        say("one")
+        say("two")
+        monkeypatch.undo()

@@ -9,7 +9,7 @@ import pytest
 import torchdyn_plan
 
 ROOT = Path(torchdyn_plan.__file__).parent
-WORDS = {"errors", "checks", "files", "keys", "precision", "threads"}
+WORDS = {"errors", "checks", "files", "keys", "precision", "progress", "schemas", "stopping", "threads"}
 """What everything may use."""
 MODELS = WORDS | {"versions", "kinematics", "nets", "planners"}
 STUDIES = MODELS | {"envs", "tasks"}

@@ -7,13 +7,16 @@ Values are looked at here, and nowhere while a model is compiled. Under ``torch.
 import difflib
 import math
 from collections.abc import Iterable
-from pathlib import Path
 
 import torch
 from torch import Tensor
 from torch.func import debug_unwrap
 
-from torchdyn_plan.errors import InputError, OutputError
+from torchdyn_plan.errors import InputError
+
+LARGEST = 10**18 - 1
+"""No whole number that somebody means is larger."""
+MOST_THREADS = 1024
 
 
 def check_trailing_shape(name: str, tensor: Tensor, *trailing: int) -> None:
@@ -92,6 +95,8 @@ def check_number(
     name: str, value: float, *, minimum: float = -math.inf, maximum: float = math.inf, integer: bool = False
 ) -> None:
     """Raise `InputError` unless ``value`` is a finite number within ``[minimum, maximum]``."""
+    if isinstance(value, int) and not isinstance(value, bool) and abs(value) > LARGEST:
+        raise InputError(f"{name} must be a number of at most 18 digits, got one of {len(str(abs(value))[:4000])}")
     if isinstance(value, bool) or not isinstance(value, (int, float)) or not math.isfinite(value):
         raise InputError(f"{name} must be a finite number, got {value!r}")
     if integer and not isinstance(value, int):
@@ -101,22 +106,28 @@ def check_number(
         raise InputError(f"{name} must be {bounds}, got {value!r}")
 
 
+def check_count(name: str, value: int, *, minimum: int = 1, maximum: int = 10_000_000) -> None:
+    """Raise `InputError` unless ``value`` is a number of things within ``[minimum, maximum]``."""
+    check_number(name, value, minimum=minimum, integer=True)
+    if value > maximum:
+        raise InputError(f"{name} must be <= {maximum}, got {value}")
+
+
+def check_seed(seed: int) -> None:
+    """Raise `InputError` unless ``seed`` is one from which series of episodes and of draws can be numbered."""
+    check_count("seed", seed, minimum=0, maximum=2**32 - 1)
+
+
+def check_threads(name: str, value: int) -> None:
+    """Raise `InputError` unless ``value`` is a number of threads, or 0 for all cores."""
+    check_count(name, value, minimum=0, maximum=MOST_THREADS)
+
+
 def check_device(device: torch.device | str) -> None:
     """Raise `InputError` unless ``device`` names a device that is here."""
     try:
-        torch.empty(1, device=device)
+        # A device that holds no numbers, as meta, has no item.
+        torch.zeros(1, device=device).item()
     except (RuntimeError, AssertionError) as error:
         reason = str(error).splitlines()[0]
         raise InputError(f"device {str(device)!r} cannot be used: {reason}") from error
-
-
-def check_writable_folder(folder: Path) -> Path:
-    """Create ``folder`` if needed and return it; raise `OutputError` if it cannot be written to."""
-    try:
-        folder.mkdir(parents=True, exist_ok=True)
-        probe = folder / ".torchdyn_plan_probe"
-        probe.write_bytes(b"x")
-        probe.unlink()
-    except OSError as error:
-        raise OutputError(f"output folder {str(folder)!r} is not writable: {error.strerror or error}") from error
-    return folder

@@ -108,7 +108,7 @@ def test_a_sweep_runs_over_any_setting_that_has_values(tmp_path):
     assert [(row.settings["drift"], row.episodes) for row in rows] == [(0.0, 24), (0.02, 24), (0.1, 24)]
     assert rows[0].success == 1.0 > rows[-1].success
     whole = evaluate(TASK, {"mine": run_to}, drift=0.1, seed=1, **QUIET).outcomes["mine"]
-    kept = json.loads((tmp_path / "points" / "drift-0.1-repeat-01.json").read_text())["mine"]
+    kept = json.loads((tmp_path / "points" / "drift-0.1-repeat-01.json").read_text())["planners"]["mine"]
     assert kept["steps"] == whole.steps.tolist()
     assert (tmp_path / "sweep.png").stat().st_size > 5_000
     with pytest.raises(InputError, match="unknown setting of drift to sweep over 'speed'"):

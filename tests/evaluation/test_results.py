@@ -1,5 +1,6 @@
 import dataclasses
 import json
+import math
 
 import pytest
 import torch
@@ -59,9 +60,18 @@ def test_files_speak_the_tasks_words():
     ("change", "message"),
     [
         (lambda content: content.pop("trapped"), "episode outcomes lack trapped"),
+        (
+            lambda content: content.update(trapped=[None, *content["trapped"][1:]]),
+            r"trapped\[0\] must be true or false, got None",
+        ),
+        (lambda content: content.update(seconds=None), "seconds must be a finite number, got None"),
+        (lambda content: content.update(cause=[["late"]] * 6), r"cause\[0\] must be a text or null"),
+        (lambda content: content.update(steps=[2**80] * 6), r"steps\[0\] must be a whole number"),
+        (lambda content: content.update(replans=[-2] * 6), r"replans\[0\] must be a number >= 0, got -2"),
+        (lambda content: content.update(pocketed=[True, math.nan] * 3), "pocketed must be"),
         (lambda content: content.update(cause=["rain"] * 6), "name unknown causes: rain"),
         (lambda content: content.update(steps=[1, 2]), r"outcomes.steps must have shape \(E,\) = \(6,\), got \(2,\)"),
-        (lambda content: content.update(solvable=[1] * 6), "outcomes.solvable must be bool"),
+        (lambda content: content.update(solvable=[1] * 6), r"solvable\[0\] must be true or false, got 1"),
     ],
 )
 def test_a_damaged_file_is_refused(change, message):

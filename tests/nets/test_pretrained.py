@@ -1,9 +1,13 @@
+import json
+import math
+import time
+
 import pytest
 import torch
 from safetensors.torch import load_file, save_file
 
-from torchdyn_plan.errors import WeightsError
-from torchdyn_plan.nets import ETANetwork, Forecaster
+from torchdyn_plan.errors import InputError, WeightsError
+from torchdyn_plan.nets import Actor, ETANetwork, Forecaster
 
 
 @pytest.fixture
@@ -83,3 +87,115 @@ def test_invalid_configuration(network, tmp_path, config):
 def test_missing_name_tells_what_there_is():
     with pytest.raises(WeightsError, match=r"no weights 'nowhere' for ETANetwork.*names that ship"):
         ETANetwork.from_pretrained("nowhere")
+
+
+def rewritten(file, tensors=None, **metadata):
+    """The file with other tensors or metadata."""
+    save_file(load_file(file) if tensors is None else tensors, file, metadata_of(file) | metadata)
+    return file
+
+
+@pytest.mark.parametrize("value", [math.nan, math.inf, -math.inf])
+def test_weights_that_are_no_numbers_are_neither_read_nor_written(network, tmp_path, value):
+    file = network.save_pretrained(tmp_path)
+    tensors = load_file(file)
+    tensors["head.bias"][3] = value
+    with pytest.raises(WeightsError, match=r"tensor 'head.bias' holds NaN or infinite values"):
+        Forecaster.from_pretrained(rewritten(file, tensors))
+    before = file.read_bytes()
+    with torch.no_grad():
+        network.head.bias[3] = value
+    with pytest.raises(InputError, match=r"head.bias of Forecaster must be finite"):
+        network.save_pretrained(tmp_path)
+    assert file.read_bytes() == before
+
+
+@pytest.mark.parametrize(
+    "dtype", [torch.float16, torch.bfloat16, torch.float64, torch.int64, torch.int32, torch.uint8, torch.bool]
+)
+def test_weights_of_another_type_are_refused(network, tmp_path, dtype):
+    file = network.save_pretrained(tmp_path)
+    tensors = load_file(file)
+    with pytest.raises(WeightsError, match=r"tensor 'head.bias' is \w+, expected F32"):
+        Forecaster.from_pretrained(rewritten(file, tensors | {"head.bias": tensors["head.bias"].to(dtype)}))
+
+
+@pytest.mark.parametrize("dtype", [torch.float16, torch.float64])
+def test_files_are_of_one_type_whatever_the_network(network, tmp_path, dtype):
+    file = network.to(dtype).save_pretrained(tmp_path)
+    assert {value.dtype for value in load_file(file).values()} == {torch.float32}
+    assert torch.equal(Forecaster.from_pretrained(file).head.weight, network.head.weight.float())
+
+
+HOSTILE = [
+    *(
+        {name: value}
+        for name in ("history", "horizon", "channels", "convolutions", "hidden", "rank")
+        for value in (10**9, 10**12, 10**30, -1, 0, 1.5, None, "300", [300], True)
+    ),
+    *({name: value} for name in ("step_scale", "half_extent") for value in (-1.0, "x", [], {}, 1e400)),
+    {"square_symmetry": None},
+]
+
+
+@pytest.mark.parametrize("change", HOSTILE, ids=str)
+def test_a_hostile_configuration_is_refused_at_once(network, tmp_path, change):
+    file = network.save_pretrained(tmp_path)
+    config = json.loads(metadata_of(file)["config"]) | change
+    rewritten(file, config=json.dumps(config))
+    started = time.process_time()
+    with pytest.raises(WeightsError, match=r"forecaster\.safetensors'"):
+        Forecaster.from_pretrained(file)
+    assert time.process_time() - started < 1.0
+
+
+@pytest.mark.parametrize(
+    "change",
+    [
+        {"hidden": 10**9},
+        {"tool_slice": [5, 5]},
+        {"tool_slice": []},
+        {"tool_slice": 3},
+        {"tool_slice": [0, 10**12]},
+        {"bins": 10**9},
+        {"robot_state_size": 10**12},
+        {"tool_slice": [[[0]], 3]},
+        {"bin_width": 10**30},
+    ],
+    ids=str,
+)
+def test_empty_slices_and_endless_bins_are_refused(tmp_path, change):
+    file = ETANetwork(hidden=8).save_pretrained(tmp_path)
+    rewritten(file, config=json.dumps(json.loads(metadata_of(file)["config"]) | change))
+    with pytest.raises(WeightsError, match=r"eta\.safetensors'"):
+        ETANetwork.from_pretrained(file)
+
+
+@pytest.mark.parametrize("change", [{"layers": 10**9}, {"layers": 10**5}, {"hidden": 10**9}], ids=str)
+def test_endless_layers_are_refused(tmp_path, change):
+    file = Actor(hidden=8, layers=1).save_pretrained(tmp_path)
+    rewritten(file, config=json.dumps(json.loads(metadata_of(file)["config"]) | change))
+    with pytest.raises(WeightsError, match=r"policy\.safetensors'"):
+        Actor.from_pretrained(file)
+
+
+@pytest.mark.parametrize(
+    "config", ["[" * 10**5, '{"hidden": ' * 10**5, '{"hidden": NaN}', '"text"', "null", "1" * 5000]
+)
+def test_nested_and_endless_json_is_refused(network, tmp_path, config):
+    file = rewritten(network.save_pretrained(tmp_path), config=config)
+    with pytest.raises(WeightsError, match="invalid configuration of Forecaster"):
+        Forecaster.from_pretrained(file)
+
+
+def test_nothing_is_allocated_before_the_header_fits(network, tmp_path, monkeypatch):
+    """A header may promise more than there is, and a configuration ask for what the file has not."""
+    file = network.save_pretrained(tmp_path)
+    rewritten(file, config=json.dumps(json.loads(metadata_of(file)["config"]) | {"hidden": 10**6}))
+    monkeypatch.setattr(torch.nn.Linear, "reset_parameters", lambda layer: forbid(layer.weight))
+    with pytest.raises(WeightsError, match="has shape"):
+        Forecaster.from_pretrained(file)
+
+
+def forbid(tensor):
+    assert tensor.is_meta, "memory was taken"

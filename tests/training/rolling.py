@@ -40,8 +40,8 @@ def write_paths(folder, *, lost=(1, 4), digest=None, **settings):
         "start": length.cumsum(0) - length,
         "pocketed": pocketed,
     }
-    save_file(tensors, folder / "paths-0-000.safetensors")
-    describe(folder, "paths", digest)
+    save_file(tensors, folder / "paths-0-000.safetensors", made(len(parts), digest))
+    describe(folder, "paths", digest, len(parts))
     return tensors
 
 
@@ -54,11 +54,17 @@ def write_arrivals(folder, *, runs=40, digest=None):
     arrival = torch.where(distance > 0.9, -1, (distance / 0.01).round().long())
     run = torch.arange(runs).repeat_interleave(5)
     tensors = {"robot_state": state, "goal": goal, "arrival": arrival, "run": run}
-    save_file(tensors, folder / "arrivals-0-000.safetensors")
+    save_file(tensors, folder / "arrivals-0-000.safetensors", made(12, digest) | {"static": "ik"})
     describe(folder, "arrivals", digest)
     return tensors
 
 
-def describe(folder, stem, digest=None):
-    about = {"arguments": {"episodes": 12, "seed": 0}, "scene": digest or TrapperScene().digest(), "versions": {}}
+def made(episodes, digest=None):
+    """What a shard says of itself."""
+    return {"scene": digest or TrapperScene().digest(), "num_envs": "4", "episodes": str(episodes)}
+
+
+def describe(folder, stem, digest=None, episodes=12):
+    arguments = {"episodes": episodes, "seed": 0, "num_envs": 4, "static": "ik"}
+    about = {"arguments": arguments, "scene": digest or TrapperScene().digest(), "versions": {}}
     (folder / f"{stem}-0.json").write_text(json.dumps(about))

@@ -1,6 +1,7 @@
 """Shards of any task's data: what is in them, which are kept, and which are refused."""
 
 import json
+import re
 from dataclasses import replace
 
 import pytest
@@ -12,13 +13,14 @@ from tests.training.toy_task import SIZES, TASK, record_arrivals, record_paths
 from torchdyn_plan.errors import InputError, WeightsError
 from torchdyn_plan.nets import Actor
 from torchdyn_plan.tasks import load_task
-from torchdyn_plan.training import collect as module
+from torchdyn_plan.training import shards
 from torchdyn_plan.training.collect import SERIES, collect
+from torchdyn_plan.training.windows import load_paths
 
 
 @pytest.fixture(autouse=True)
 def short(monkeypatch):
-    monkeypatch.setattr(module, "SHARD", {"paths": 6, "arrivals": 24})
+    monkeypatch.setattr(shards, "SHARD", {"paths": 6, "arrivals": 24})
 
 
 def gather(out, what="paths", task=TASK, **settings):
@@ -166,3 +168,86 @@ def test_a_recorder_that_leaves_something_out_is_named(tmp_path):
 
     with pytest.raises(InputError, match="what toy records of paths lacks start, length"):
         gather(tmp_path, task=replace(TASK, record_paths=record))
+
+
+def fits(folder, what="arrivals"):
+    """What training takes the data in ``folder`` for."""
+    return shards.read_description(folder, what, scene="toy-1")
+
+
+def test_shards_are_held_against_their_description(tmp_path):
+    gather(tmp_path, episodes=10)
+    assert fits(tmp_path, "paths")["data"][0]["episodes"] == 10
+    with pytest.raises(InputError, match=r"paths-0-001.* lies beyond the 6 episodes asked for"):
+        gather(tmp_path, episodes=6)
+    text = (tmp_path / "paths-0.json").read_text()
+    (tmp_path / "paths-0.json").write_text(text.replace('"episodes": 10', '"episodes": 6'))
+    with pytest.raises(InputError, match=r"paths-0-001.* belongs to no description"):
+        fits(tmp_path, "paths")
+    (tmp_path / "paths-0.json").write_text(text.replace('"episodes": 10', '"episodes": 13'))
+    with pytest.raises(InputError, match=r"paths-0-001.* is not what its description says: episodes is 4 there, 6 in"):
+        fits(tmp_path, "paths")
+    (tmp_path / "paths-0.json").write_text(text)
+    (tmp_path / "paths-0-000.safetensors").unlink()
+    with pytest.raises(InputError, match=r"paths-0-000.*not a whole safetensors file"):
+        fits(tmp_path, "paths")
+
+
+def test_a_killed_collection_is_not_taken_for_a_whole_one(tmp_path):
+    def killed(blocks, **how):
+        if blocks[0][0] > 0:
+            raise KeyboardInterrupt
+        return record_paths(blocks, **how)
+
+    gather(tmp_path, episodes=10)
+    with pytest.raises(KeyboardInterrupt):
+        gather(tmp_path, task=replace(TASK, record_paths=killed), seed=1)
+    with pytest.raises(InputError, match=r"paths-1-000.* belongs to no description.*did not finish"):
+        fits(tmp_path, "paths")
+    gather(tmp_path, seed=1)
+    assert [one["seed"] for one in fits(tmp_path, "paths")["data"]] == [0, 1]
+
+
+def test_arrivals_of_two_static_planners_train_no_network(tmp_path):
+    gather(tmp_path, "arrivals")
+    assert fits(tmp_path)["static"] == "straight"
+    gather(tmp_path, "arrivals", static="learned", seed=1)
+    with pytest.raises(InputError, match=r"arrivals-1-000.* has arrivals of learned, others .* of straight"):
+        fits(tmp_path)
+
+
+@pytest.mark.parametrize(
+    "text", ["", "{", "[]", "{}", '{"scene": "toy-1", "arguments": null}', '{"scene": 3, "arguments": {}}', "[" * 10**5]
+)
+def test_a_damaged_description_is_named(tmp_path, text):
+    gather(tmp_path)
+    (tmp_path / "paths-0.json").write_text(text)
+    with pytest.raises(InputError, match=r"paths-0\.json"):
+        fits(tmp_path, "paths")
+    about = {"episodes": -3, "seed": 0, "num_envs": 4, "static": "x"}
+    for name, value in (("episodes", -3), ("episodes", 1e400), ("seed", None), ("num_envs", "4"), ("static", 1)):
+        changed = {"scene": "toy-1", "arguments": about | {"episodes": 10} | {name: value}}
+        (tmp_path / "paths-0.json").write_text(json.dumps(changed))
+        with pytest.raises(InputError, match=r"paths-0\.json"):
+            fits(tmp_path, "paths")
+
+
+@pytest.mark.parametrize(
+    "change",
+    [
+        {"start": torch.zeros(6, dtype=torch.int64)},
+        {"length": torch.zeros(6)},
+        {"positions": torch.full((3, 3), torch.nan)},
+        {"positions": torch.zeros(4)},
+        {"pocketed": torch.zeros(2, dtype=torch.bool)},
+    ],
+    ids=lambda change: next(iter(change)),
+)
+def test_paths_that_do_not_lie_end_to_end_are_refused(tmp_path, change):
+    gather(tmp_path, episodes=6)
+    file = tmp_path / "paths-0-000.safetensors"
+    with safe_open(file, "pt") as content:
+        made = content.metadata()
+    save_file(load_file(file) | change, file, made)
+    with pytest.raises(InputError, match=re.escape(str(tmp_path))):
+        load_paths(tmp_path)

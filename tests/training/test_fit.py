@@ -108,7 +108,7 @@ def test_data_of_another_scene_or_without_description_is_named(data, tmp_path, f
     with pytest.raises(InputError, match=f"{stem}-0.json' tells of scene 0123, but the scene is"):
         fit_with(fit, data, tmp_path)
     (data / f"{stem}-0.json").write_text("{")
-    with pytest.raises(InputError, match=f"{stem}-0.json' is no description"):
+    with pytest.raises(InputError, match=f"{stem}-0.json' is no JSON file"):
         fit_with(fit, data, tmp_path)
     (data / f"{stem}-0.json").unlink()
     with pytest.raises(InputError, match=f"no {stem}-.*did not finish"):

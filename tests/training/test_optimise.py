@@ -1,11 +1,17 @@
 import json
+import math
+import os
+import random
+import signal
 
 import pytest
 import torch
-from safetensors.torch import load_file
+from safetensors.torch import load_file, save_file
 from torch import nn
 
 from torchdyn_plan.errors import InputError, TrainingError
+from torchdyn_plan.stopping import terminable
+from torchdyn_plan.training import checkpoint
 from torchdyn_plan.training.optimise import Recipe, optimise
 
 
@@ -101,7 +107,7 @@ def test_a_damaged_checkpoint_is_named(tmp_path, kept):
     fit(tmp_path)
     file = tmp_path / "checkpoint.safetensors"
     file.write_bytes(file.read_bytes()[:kept])
-    with pytest.raises(TrainingError, match=r"checkpoint\.safetensors' is damaged.*without resume"):
+    with pytest.raises(TrainingError, match=r"damaged checkpoint: .*checkpoint\.safetensors' is not.*without resume"):
         fit(tmp_path)
     fit(tmp_path, resume=False)
 
@@ -119,3 +125,107 @@ def test_rate_rises_and_falls_to_zero():
 def test_wrong_recipes_are_named(change):
     with pytest.raises(InputError, match=next(iter(change))):
         Recipe(**{"steps": 1, "batch": 1, "lr": 1.0} | change)
+
+
+def damaged(file, tensors=None, **changes):
+    """The checkpoint with other metadata, None for none; its digest is as it was, unless it is told, too."""
+    from safetensors import safe_open
+
+    with safe_open(file, framework="pt") as content:
+        metadata = content.metadata() | changes
+    save_file(tensors or load_file(file), file, {name: value for name, value in metadata.items() if value is not None})
+
+
+def signed(file, **changes):
+    """The same as somebody would write it who knows how: the digest fits."""
+    from safetensors import safe_open
+
+    with safe_open(file, framework="pt") as content:
+        metadata = content.metadata() | changes
+    damaged(file, **changes, digest=checkpoint._digest(metadata, load_file(file)))
+
+
+WHOLE = {"step": 7, "total": 0.5, "counted": 1, "curve": []}
+WRONG = (None, "x", -1, {}, [3], 1.5e400, 2**70, True)
+BAD_PROGRESS = [
+    *({}, None, [], 3, "text", {"curve": [{"step": None}]}, {"curve": [[1]]}, {"total": math.nan}),
+    # A sum of losses may well be -1 or 2^70, and a curve empty.
+    *({name: value} for name in WHOLE for value in WRONG if name != "total" or value not in (-1, 2**70)),
+]
+
+
+@pytest.mark.parametrize("change", BAD_PROGRESS, ids=str)
+@pytest.mark.parametrize("write", [damaged, signed])
+def test_damaged_progress_is_named(tmp_path, change, write, fitted):
+    file = tmp_path / "checkpoint.safetensors"
+    file.write_bytes(fitted)
+    progress = WHOLE | change if isinstance(change, dict) and change else change
+    write(file, progress=json.dumps(progress))
+    with pytest.raises(TrainingError, match=r"checkpoint\.safetensors'.*without resume"):
+        fit(tmp_path)
+
+
+@pytest.fixture(scope="module")
+def fitted(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("fitted")
+    fit(folder, steps=40, checkpoint_seconds=60.0)
+    return (folder / "checkpoint.safetensors").read_bytes()
+
+
+@pytest.mark.parametrize(
+    "changes",
+    [
+        {"settings": "null"},
+        {"settings": "[]"},
+        {"settings": "{"},
+        {"settings": None},
+        {"progress": None},
+        {"digest": None},
+        {"digest": "0"},
+        {"format": "1"},
+        {"settings": "[" * 10**5},
+        {"progress": "[" * 10**5},
+    ],
+    ids=str,
+)
+def test_damaged_settings_are_named(tmp_path, changes, fitted):
+    file = tmp_path / "checkpoint.safetensors"
+    file.write_bytes(fitted)
+    damaged(file, **changes)
+    with pytest.raises(TrainingError, match=r"checkpoint\.safetensors'.*without resume"):
+        fit(tmp_path)
+
+
+def test_every_flipped_bit_is_found(tmp_path, fitted):
+    file = tmp_path / "checkpoint.safetensors"
+    draw = random.Random(0)
+    for place in draw.sample(range(len(fitted)), 60):
+        changed = bytearray(fitted)
+        changed[place] ^= 1 << draw.randrange(8)
+        file.write_bytes(changed)
+        with pytest.raises(TrainingError, match=r"checkpoint\.safetensors'"):
+            fit(tmp_path)
+    file.write_bytes(fitted)
+    assert fit(tmp_path)[2] == 0
+
+
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+def test_a_signal_saves_the_step_that_is_going_on(tmp_path, number, monkeypatch):
+    """No time between checkpoints has passed, and none is lost."""
+    whole, whole_curve, _ = fit(tmp_path / "whole", checkpoint_seconds=3600.0)
+    step = torch.optim.AdamW.step
+    steps = []
+
+    def told(self, *args, **kwargs):
+        steps.append(None)
+        if len(steps) == 17:
+            os.kill(os.getpid(), number)
+        return step(self, *args, **kwargs)
+
+    monkeypatch.setattr(torch.optim.AdamW, "step", told)
+    with pytest.raises(KeyboardInterrupt), terminable():
+        fit(tmp_path / "cut", checkpoint_seconds=3600.0)
+    rest, rest_curve, calls = fit(tmp_path / "cut", checkpoint_seconds=3600.0)
+    assert calls == 40 - 17
+    assert torch.equal(rest.weight, whole.weight)
+    assert rest_curve == whole_curve

@@ -1,6 +1,7 @@
 """DDPG with hindsight, and its averaged form: they learn, resume exactly, keep the best, refuse what does not fit."""
 
 import csv
+import json
 import os
 import signal
 import subprocess
@@ -11,11 +12,14 @@ from pathlib import Path
 
 import pytest
 import torch
-from safetensors.torch import load_file
+from safetensors import safe_open
+from safetensors.torch import load_file, save_file
 
 from tests.training.points import PointTask
 from torchdyn_plan.errors import InputError, TrainingError
 from torchdyn_plan.nets.policy import Actor
+from torchdyn_plan.stopping import Terminated, terminable
+from torchdyn_plan.training import checkpoint
 from torchdyn_plan.training.algorithms import ALGORITHMS, learner_type, recipe_for
 from torchdyn_plan.training.averaged import AveragedDDPG, AveragedRecipe
 from torchdyn_plan.training.ddpg import DDPG
@@ -25,6 +29,9 @@ from torchdyn_plan.training.policy import fit_policy
 RECIPE = DDPGRecipe(iterations=12, num_envs=8, updates=20, batch=64, capacity=500, warmup=2, gamma=0.9)
 RECIPES = {"ddpg": RECIPE, "averaged": AveragedRecipe.like(RECIPE)}
 RECIPES["averaged"] = replace(RECIPES["averaged"], iterations=12, gamma=0.9)
+
+
+SHORT = replace(RECIPE, iterations=2, updates=2, warmup=1)
 
 
 class CutError(Exception):
@@ -153,6 +160,79 @@ def test_refuses_another_configuration_before_anything_is_written(tmp_path: Path
     with pytest.raises(TrainingError, match="made with task 'points', not 'squares'"):
         fit_policy(Other(), tmp_path, recipe=short, score_every=1)
     assert before == {file: file.stat().st_mtime_ns for file in (tmp_path / "policy").iterdir()}
+
+
+@pytest.fixture(scope="module")
+def trained(tmp_path_factory: pytest.TempPathFactory) -> bytes:
+    folder = tmp_path_factory.mktemp("trained")
+    fit_policy(PointTask(), folder, recipe=SHORT, score_every=1)
+    return (folder / "policy" / "checkpoint.safetensors").read_bytes()
+
+
+def signed(file: Path, tensors: dict[str, torch.Tensor], **changes: str) -> None:
+    """Write the checkpoint as somebody would who knows how: its digest fits."""
+    with safe_open(file, framework="pt") as content:
+        metadata = content.metadata() | changes
+    save_file(tensors, file, metadata | {"digest": checkpoint._digest(metadata, tensors)})
+
+
+@pytest.mark.parametrize(
+    "progress",
+    [{}, None, [], {"ddpg": None}, {"ddpg": {"iteration": 1}}, {"curve": None}, {"best": {"success": None}}],
+    ids=str,
+)
+def test_damaged_progress_is_named(tmp_path: Path, trained: bytes, progress: object) -> None:
+    file = tmp_path / "policy" / "checkpoint.safetensors"
+    file.parent.mkdir()
+    file.write_bytes(trained)
+    if progress:
+        with safe_open(file, framework="pt") as content:
+            assert isinstance(progress, dict)
+            progress = json.loads(content.metadata()["progress"]) | progress
+    signed(file, load_file(file), progress=json.dumps(progress))
+    with pytest.raises(TrainingError, match=r"checkpoint\.safetensors': .*progress"):
+        fit_policy(PointTask(), tmp_path, recipe=SHORT, score_every=1)
+
+
+@pytest.mark.parametrize("prefix", ["best.", "replay.", "optimiser.", "generator", "loss."])
+def test_damaged_tensors_are_named(tmp_path: Path, trained: bytes, prefix: str) -> None:
+    file = tmp_path / "policy" / "checkpoint.safetensors"
+    file.parent.mkdir()
+    file.write_bytes(trained)
+    tensors = load_file(file)
+    cut = {name: value[:1] if name.startswith(prefix) and value.ndim else value for name, value in tensors.items()}
+    save_file(cut, file, safe_open(file, framework="pt").metadata())
+    with pytest.raises(TrainingError, match=r"checkpoint\.safetensors' holds something else than was written"):
+        fit_policy(PointTask(), tmp_path, recipe=SHORT, score_every=1)
+
+
+def test_a_full_disk_for_the_log_is_no_reason_to_stop(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    tensorboard = pytest.importorskip("torch.utils.tensorboard")
+
+    def full(*_: object, **__: object) -> None:
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr(tensorboard.SummaryWriter, "add_scalar", full)
+    assert fit_policy(PointTask(), tmp_path, recipe=SHORT, score_every=1).is_file()
+
+
+def test_a_signal_saves_the_round_that_is_going_on(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    recipe = replace(SHORT, iterations=4)
+    fit_policy(PointTask(), tmp_path / "whole", recipe=recipe, score_every=4)
+    collect = DDPG.collect
+
+    def told(self: DDPG) -> dict[str, float]:
+        if self.iteration == 2:
+            os.kill(os.getpid(), signal.SIGTERM)
+        return collect(self)
+
+    with monkeypatch.context() as patch:
+        patch.setattr(DDPG, "collect", told)
+        with pytest.raises(Terminated), terminable():
+            fit_policy(PointTask(), tmp_path / "cut", recipe=recipe, score_every=4)
+    fit_policy(PointTask(), tmp_path / "cut", recipe=recipe, score_every=4)
+    whole, cut = weights(tmp_path / "whole"), weights(tmp_path / "cut")
+    assert all(torch.equal(value, cut[name]) for name, value in whole.items())
 
 
 @pytest.mark.parametrize(("name", "value"), [("num_envs", 0), ("gamma", 1.5), ("noise", -0.1), ("lr_actor", 0.0)])

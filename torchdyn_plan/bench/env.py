@@ -18,6 +18,7 @@ from torchdyn_plan.bench.timing import figures
 from torchdyn_plan.envs.moving_target import MovingTargetEnv
 from torchdyn_plan.errors import InputError
 from torchdyn_plan.evaluation.episodes import EpisodeLog, Planner, play
+from torchdyn_plan.progress import progress_bar
 from torchdyn_plan.tasks import DEFAULT, Task, load_task
 from torchdyn_plan.threads import one_thread
 from torchdyn_plan.versions import usable_cores
@@ -67,13 +68,11 @@ def bench(
         InputError: the environment has no ``simulation.batch`` that is a `mujoco.batch.Batch`.
         OutputError: the file cannot be written.
     """
-    from tqdm import tqdm
-
     task = load_task(task)
     about = {"task": task.name, "sizes": list(sizes), "steps": steps, "threads": threads}
     record = Record(out, show=show, benchmark="env", **about)
     drivers = _planners(task, planners)
-    bar = tqdm(
+    bar = progress_bar(
         total=len(sizes) * (1 + len(drivers)) * steps, desc="env", unit="step", leave=False, disable=not progress
     )
     with one_thread(), torch.no_grad(), bar:

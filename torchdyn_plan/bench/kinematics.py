@@ -23,6 +23,7 @@ from torchdyn_plan.errors import CompileError
 from torchdyn_plan.evaluation.plots import plot_bench
 from torchdyn_plan.kinematics import Arm, compiled_pose_and_jacobian, solve_ik
 from torchdyn_plan.planners import IKPlanner
+from torchdyn_plan.progress import progress_bar
 from torchdyn_plan.tasks import DEFAULT, Task, load_task
 from torchdyn_plan.threads import one_thread
 
@@ -65,8 +66,6 @@ def bench(
     Raises:
         OutputError: the file cannot be written.
     """
-    from tqdm import tqdm
-
     task = load_task(task)
     about = {"task": task.name, "batches": list(batches), "seconds": seconds, "compiled": compiled}
     record = Record(out, show=show, benchmark="kinematics", **about)
@@ -74,7 +73,7 @@ def bench(
     planner = static if isinstance(static, IKPlanner) else None
     others = installed((PytorchKinematics, Pinocchio, Mink)) if rivals else []
     devices = ["cpu", *(["cuda"] if torch.cuda.is_available() else [])]
-    bar = tqdm(desc="kinematics", unit="figure", leave=False, disable=not progress)
+    bar = progress_bar(desc="kinematics", unit="figure", leave=False, disable=not progress)
     with one_thread(), torch.no_grad(), bar:
         for device in devices:
             own = _Own(device, planner, compiled=compiled)

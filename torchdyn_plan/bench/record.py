@@ -7,9 +7,8 @@ from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
 
-from torchdyn_plan.checks import check_writable_folder
-from torchdyn_plan.errors import OutputError
-from torchdyn_plan.files import write_json
+from torchdyn_plan.errors import InputError, OutputError
+from torchdyn_plan.files import check_writable_folder, is_folder, short_path, write_json
 from torchdyn_plan.versions import library_versions, machine
 
 Row = dict[str, Any]
@@ -33,15 +32,18 @@ class Record:
             config: what is run, for the file.
 
         Raises:
+            InputError: ``out`` is no JSON file by its name: plots are put beside it, by names of their own.
             OutputError: no file can be written at ``out``.
         """
         self.rows: list[Row] = []
         self.out, self.show = None if out is None else Path(out), show
         self.about = {"config": config}
         if self.out is not None:
+            if is_folder(self.out):
+                raise OutputError(f"output file {short_path(self.out)} is a folder")
+            if self.out.suffix != ".json":
+                raise InputError(f"output file {short_path(self.out)} must end in .json")
             check_writable_folder(self.out.parent)
-            if self.out.is_dir():
-                raise OutputError(f"output file {str(out)!r} is a folder")
             self.about |= {"machine": machine(), "versions": library_versions()}
 
     def add(self, row: Mapping[str, Any]) -> None:

@@ -17,9 +17,10 @@ from torchdyn_plan.bench.record import Record, Row
 from torchdyn_plan.bench.replan_forms import COMPILED, Form, make_forms
 from torchdyn_plan.bench.replan_parts import in_blocks
 from torchdyn_plan.bench.timing import figures, sample
-from torchdyn_plan.checks import check_choice, check_device, check_number
+from torchdyn_plan.checks import check_choice, check_count, check_device, check_number, check_threads
 from torchdyn_plan.errors import InputError
 from torchdyn_plan.evaluation.episodes import Planner
+from torchdyn_plan.progress import progress_bar
 from torchdyn_plan.tasks import Task, load_task
 from torchdyn_plan.threads import torch_threads
 from torchdyn_plan.versions import usable_cores
@@ -28,6 +29,8 @@ BATCHES = (1, 1024)
 """Rows that plan at once, if nobody says how many."""
 SECONDS = 0.2
 """Time spent on each figure, if nobody says how long [s]."""
+LONGEST = 3600.0
+"""Most time that may be spent on a figure [s]."""
 BLOCK = 1024
 """Rows that are worked on at a time on a processor, if there are more."""
 SINGLES = 16
@@ -120,9 +123,11 @@ def _check(batches: Sequence[int], seconds: float, threads: int, device: torch.d
     if not batches:
         raise InputError("batches must name one number of rows at least, got none")
     for batch in batches:
-        check_number("batches", batch, minimum=1, integer=True)
+        check_count("batches", batch)
     check_number("seconds", seconds, minimum=0.0)
-    check_number("threads", threads, minimum=0, integer=True)
+    if seconds > LONGEST:
+        raise InputError(f"seconds must be <= {LONGEST:g}, got {seconds:g}")
+    check_threads("threads", threads)
     check_device(device)
     check_choice("kind of device to measure on", torch.device(device).type, COMPILED)
 
@@ -137,11 +142,9 @@ def _measure(
     progress: bool,
 ) -> Generator[Row]:
     """The rows, one after the other."""
-    from tqdm import tqdm
-
     planners = {name: one.planner for name, one in chosen.items()}
     with ExitStack() as stack:
-        bar = stack.enter_context(tqdm(desc="re-plan", unit="figure", leave=False, disable=not progress))
+        bar = stack.enter_context(progress_bar(desc="re-plan", unit="figure", leave=False, disable=not progress))
         for planner in planners.values():
             stack.enter_context(_stays(planner))
         whole: dict[str, Moments] = {}

@@ -1,38 +1,68 @@
 """The command line. What a command works with is imported when the command runs, so that help answers at once."""
 
+import contextlib
 import io
-import os
 import sys
 from collections.abc import Iterable, Sequence
-from typing import Any
+from contextlib import AbstractContextManager
+from typing import Any, NoReturn
 
+from torchdyn_plan.cli.output import silence
 from torchdyn_plan.errors import InputError, TorchdynPlanError
+from torchdyn_plan.stopping import Terminated, terminable
 
 PROGRAM = "torchdyn-plan"
 
 
 def main(words: Sequence[str] | None = None) -> None:
-    """Entry of ``torchdyn-plan``: exits 0 when done, 2 on a mistake in the arguments or the world, 130 on Ctrl-C."""
+    """Entry of ``torchdyn-plan``.
+
+    Exits 0 when done, 2 on a mistake in the arguments or the world, 130 on Ctrl-C and 143 on SIGTERM.
+    """
     for stream in (sys.stdout, sys.stderr):
         # A terminal without "–" or "─" shows a question mark: a table is no reason to fail.
         if isinstance(stream, io.TextIOWrapper):
             stream.reconfigure(errors="replace")
     try:
-        _run(sys.argv[1:] if words is None else words)
-        sys.stdout.flush()
+        with terminable():
+            _run(sys.argv[1:] if words is None else words)
+            if sys.stdout is not None:
+                sys.stdout.flush()
     except BrokenPipeError:
-        # Nobody reads on. Python flushes once more at exit: that goes to nowhere.
-        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
-    except TorchdynPlanError as error:
-        print(f"{PROGRAM}: error: {error}", file=sys.stderr)
-        sys.exit(2)
+        silence()
+    except (TorchdynPlanError, OSError, MemoryError) as error:
+        _fail(2, f"error: {_in_one_line(error)}")
+    except RuntimeError as error:
+        # PyTorch's own way of saying it.
+        if "not enough memory" not in str(error) and "out of memory" not in str(error):
+            raise
+        _fail(2, f"error: {_in_one_line(error)}")
+    except Terminated:
+        _fail(143, "terminated")
     except KeyboardInterrupt:
-        print(f"{PROGRAM}: interrupted", file=sys.stderr)
-        sys.exit(130)
+        _fail(130, "interrupted")
+
+
+def _fail(code: int, text: str) -> NoReturn:
+    """Say ``text`` in a line and exit with ``code``, whoever listens."""
+    if code == 2 and sys.stdout is not None:
+        try:
+            sys.stdout.flush()
+        except OSError:
+            silence()
+    with contextlib.suppress(OSError):
+        print(f"{PROGRAM}: {text}", file=sys.stderr, flush=True)
+    sys.exit(code)
+
+
+def _in_one_line(error: Exception) -> str:
+    if isinstance(error, MemoryError):
+        return "not enough memory"
+    return " ".join(str(error).split()) or type(error).__name__
 
 
 def _run(words: Sequence[str]) -> None:
-    """Parse ``words`` and run the command that they are."""
+    """Parse ``words`` and run the command that they are; folders made for it go again if nothing was written there."""
     try:
         import tyro
     except ImportError as error:
@@ -41,6 +71,7 @@ def _run(words: Sequence[str]) -> None:
     from torchdyn_plan.cli.arguments import BenchArguments, TrainArguments
     from torchdyn_plan.tasks import load_task
 
+    forms.check_words(words)
     named, others = forms.task_of(words)
     task = load_task(named)
     if others[:1] == ["train"]:
@@ -48,18 +79,31 @@ def _run(words: Sequence[str]) -> None:
         network = _network(task.name, networks, others[1:])
         about = {"prog": f"{PROGRAM} train", "description": f"Train a network of {task.name}.", "args": others[1:]}
         parsed: Any = tyro.extras.subcommand_cli_from_dict(networks, **about)
-        commands.train(task, network, parsed)
+        parsed = commands.with_folders(task, parsed)
+        with _unless_in_vain(parsed):
+            commands.train(task, network, parsed)
         return
     if others[:1] == ["bench"]:
         _check_benchmark(others[1:])
         about = {"prog": f"{PROGRAM} bench", "description": str(BenchArguments.__doc__), "args": others[1:]}
         parsed = tyro.extras.subcommand_cli_from_dict(forms.bench_forms(task, named), **about)
-        # Planners know the tasks that they belong to, unless another one is asked for.
-        commands.run(task if len(others) < len(words) else None, parsed)
+        with _unless_in_vain(parsed):
+            # Planners know the tasks that they belong to, unless another one is asked for.
+            commands.run(task if len(others) < len(words) else None, parsed)
         return
     choices: dict[str, Any] = {**forms.command_forms(task, named), "bench": BenchArguments, "train": TrainArguments}
     about = {"prog": PROGRAM, "description": "Planners for static targets, made to meet moving ones.", "args": others}
-    commands.run(task, tyro.extras.subcommand_cli_from_dict(choices, **about))
+    parsed = commands.with_folders(task, tyro.extras.subcommand_cli_from_dict(choices, **about))
+    with _unless_in_vain(parsed):
+        commands.run(task, parsed)
+
+
+def _unless_in_vain(arguments: Any) -> AbstractContextManager[None]:
+    """Remove folders that are made for ``arguments.out`` meanwhile, if an error leaves them empty."""
+    from torchdyn_plan.files import no_empty_folders
+
+    out = arguments.out
+    return contextlib.nullcontext() if out is None else no_empty_folders(out.parent if out.suffix == ".json" else out)
 
 
 def _check_benchmark(words: Sequence[str]) -> None:

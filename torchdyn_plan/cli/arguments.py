@@ -19,8 +19,15 @@ BENCHMARKS = {
 }
 """Name of each benchmark, and the module whose ``bench()`` measures and whose ``plot``, if any, draws the rows."""
 
-DATA = Path("runs/data")
-"""Folder of collected data, if no other is named."""
+DATA, TRAINING = Path("runs/data"), Path("runs/training")
+"""Folders of collected data and of trainings, a folder in them for each task and static planner."""
+
+
+def default_folder(base: Path, task: str, static: str = "") -> Path:
+    """Where the data or networks of ``task`` lie, those of a ``static`` planner apart from another's."""
+    name = f"{task}-{static}" if static else task
+    # A task of another module is called by its place.
+    return base / name.replace(":", ".").replace("/", ".")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -53,6 +60,8 @@ class EpisodeArguments(Arguments):
     """Time by which every plan comes late, whole control steps; planners that make no plans have none."""
     compensate: bool = True
     """Tell the planners of that time, so that they plan for the moment when the plan is there."""
+    overwrite: bool = False
+    """Take the place of results of something else that the folder holds; otherwise they are left, and refused."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -82,8 +91,8 @@ class CollectArguments(Arguments):
 
     what: str
     static: str = ""
-    out: Path = DATA
-    """Folder for the shards of data."""
+    out: Path | None = None
+    """Folder for the shards of data; runs/data/TASK-STATIC when not given."""
     weights: Path | None = None
     """Of a static planner that is a policy: a file, or a folder of its training; the one that ships when not given."""
     episodes: int = 20000
@@ -100,8 +109,9 @@ class CollectArguments(Arguments):
 class TrainArguments(Arguments):
     """Train a network, on collected data or by trial; a killed run continues where its folder stands."""
 
-    out: Path = Path("runs/training")
-    """Folder for checkpoints, the curve and the weights, one for each network."""
+    out: Path | None = None
+    """Folder for checkpoints, curve and weights, in which each network has its own; when not given,
+    runs/training/TASK-STATIC, and of policies runs/training/TASK."""
     steps: int | None = None
     """Optimiser steps; the recipe's own when not given."""
     batch: int | None = None
@@ -120,8 +130,9 @@ class TrainArguments(Arguments):
 class FitArguments(TrainArguments):
     """Fit a network to collected data."""
 
-    data: Path = DATA
-    """Folder of the collected shards."""
+    static: str | None = None
+    data: Path | None = None
+    """Folder of the collected shards; runs/data/TASK-STATIC when not given."""
 
 
 @dataclass(frozen=True, kw_only=True)

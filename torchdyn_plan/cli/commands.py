@@ -5,12 +5,13 @@ from __future__ import annotations
 import importlib
 import sys
 from collections.abc import Callable, Mapping
-from dataclasses import asdict, fields
+from dataclasses import asdict, fields, replace
 from typing import TYPE_CHECKING, Any
 
 from torchdyn_plan.cli.arguments import (
     BENCHMARKS,
     DATA,
+    TRAINING,
     Arguments,
     BenchArguments,
     CollectArguments,
@@ -21,7 +22,9 @@ from torchdyn_plan.cli.arguments import (
     ReplanArguments,
     SweepArguments,
     TrainArguments,
+    default_folder,
 )
+from torchdyn_plan.cli.output import say
 from torchdyn_plan.errors import InputError
 from torchdyn_plan.tasks import Task
 
@@ -35,20 +38,33 @@ def run(task: Task | None, arguments: Arguments) -> None:
     command(task, arguments)
 
 
+def with_folders(task: Task, arguments: Any) -> Any:
+    """``arguments`` with the folders that they leave open."""
+    from torchdyn_plan.checks import check_choice
+
+    if isinstance(arguments, (CollectArguments, FitArguments)) and arguments.static:
+        check_choice(f"static planner of {task.name}", arguments.static, task.static_planners)
+    if isinstance(arguments, CollectArguments):
+        static = arguments.static or task.default_static
+        return replace(arguments, out=arguments.out or default_folder(DATA, task.name, static))
+    if isinstance(arguments, FitArguments):
+        static = arguments.static or task.default_static
+        data = arguments.data or default_folder(DATA, task.name, static)
+        return replace(arguments, data=data, out=arguments.out or default_folder(TRAINING, task.name, static))
+    if isinstance(arguments, TrainArguments):
+        return replace(arguments, out=arguments.out or default_folder(TRAINING, task.name))
+    return arguments
+
+
 def evaluate(task: Task, arguments: EvaluateArguments) -> None:
     """Run the episodes, write the results and print the table."""
-    from torchdyn_plan.checks import check_writable_folder
     from torchdyn_plan.evaluation import evaluate
 
     task.default_settings(**asdict(arguments.settings))
+    found = evaluate(task, arguments.planners, out=arguments.out, **_shared(task, arguments))
+    say(found.table())
     if arguments.out is not None:
-        check_writable_folder(arguments.out)
-    found = evaluate(task, arguments.planners, **_shared(task, arguments))
-    if arguments.out is not None:
-        found.save(arguments.out)
-    print(found.table())
-    if arguments.out is not None:
-        print(f"\nwritten: {', '.join(str(path) for path in sorted(arguments.out.iterdir()))}")
+        say(f"\nwritten: {', '.join(str(path) for path in sorted(arguments.out.iterdir()))}")
 
 
 def sweep(task: Task, arguments: SweepArguments) -> None:
@@ -65,15 +81,16 @@ def sweep(task: Task, arguments: SweepArguments) -> None:
         repeats=arguments.repeats,
         **_shared(task, arguments),
     )
-    print(format_table(task, rows))
+    say(format_table(task, rows))
 
 
 def collect(task: Task, arguments: CollectArguments) -> None:
     """Gather the data."""
-    from torchdyn_plan.checks import check_writable_folder
-
-    check_writable_folder(arguments.out)
+    from torchdyn_plan.files import check_writable_folder
     from torchdyn_plan.training.collect import collect
+
+    assert arguments.out is not None
+    check_writable_folder(arguments.out)
 
     collect(
         task,
@@ -90,20 +107,26 @@ def collect(task: Task, arguments: CollectArguments) -> None:
 
 def train(task: Task, network: str, arguments: TrainArguments) -> None:
     """Train the network, or go on where its folder stands."""
-    from torchdyn_plan.checks import check_writable_folder
-
-    check_writable_folder(arguments.out)
+    from torchdyn_plan.files import check_writable_folder
     from torchdyn_plan.training.train import train
+
+    assert arguments.out is not None
+    check_writable_folder(arguments.out)
+    data = arguments.out
 
     own: dict[str, Any] = {}
     if isinstance(arguments, PolicyArguments):
         own["options"] = task.policies[network].options(**asdict(arguments.training))
         own |= {"num_envs": arguments.num_envs, "num_threads": arguments.threads, "workers": arguments.workers}
         own["algorithm"] = arguments.algorithm
+    elif isinstance(arguments, FitArguments):
+        assert arguments.data is not None
+        data = arguments.data
+        own["static"] = arguments.static
     train(
         task,
         network,
-        arguments.data if isinstance(arguments, FitArguments) else DATA,
+        data,
         arguments.out,
         steps=arguments.steps,
         batch=arguments.batch,
@@ -133,7 +156,7 @@ def _print_row(row: Mapping[str, Any]) -> None:
     from tqdm import tqdm
 
     with tqdm.external_write_mode(file=sys.stdout):
-        print("  ".join(f"{name} {_short(value)}" for name, value in row.items()), flush=True)
+        say("  ".join(f"{name} {_short(value)}" for name, value in row.items()))
 
 
 def _short(value: Any) -> str:
@@ -160,6 +183,7 @@ def _shared(task: Task, arguments: EpisodeArguments) -> dict[str, Any]:
         "num_threads": arguments.threads,
         "delivery": _delivery(task, arguments),
         "weights": arguments.weights,
+        "overwrite": arguments.overwrite,
         **asdict(arguments.settings),
     }
 
@@ -169,8 +193,11 @@ def _delivery(task: Task, arguments: EpisodeArguments) -> Delivery | None:
     from torchdyn_plan.checks import check_number
     from torchdyn_plan.planners import Delayed
 
-    check_number("latency_ms", arguments.latency_ms, minimum=0.0)
     step_ms = 1000 * task.control_step
+    check_number("latency_ms", arguments.latency_ms, minimum=0.0)
+    if arguments.latency_ms > step_ms * task.max_steps:
+        longest = f"an episode of {task.name}, {step_ms * task.max_steps:g} ms"
+        raise InputError(f"latency_ms must be no longer than {longest}, got {arguments.latency_ms:g}")
     steps = round(arguments.latency_ms / step_ms)
     # A millionth of a step is rounding.
     if abs(arguments.latency_ms / step_ms - steps) > 1e-6:

@@ -30,6 +30,14 @@ FITTED = {
 """Networks that are fitted to data, and what ``--help`` says of them."""
 
 
+def check_words(words: Sequence[str]) -> None:
+    """Raise `InputError` for an option that is given nothing: an empty folder would be the one that one is in."""
+    for before, word in zip(("", *words), words, strict=False):
+        if not word.strip() or (word.startswith("--") and word.endswith("=")):
+            option = word.rstrip("=") if word.strip() else before
+            raise InputError(f"{option or 'a word'} is given nothing")
+
+
 def task_of(words: Sequence[str]) -> tuple[str, list[str]]:
     """The task that ``--task NAME`` or ``--task=NAME`` names, the last of several, and the other words."""
     name, others, rest = DEFAULT, [], iter(words)
@@ -83,7 +91,14 @@ def train_forms(task: Task, named: str) -> dict[str, type[Arguments]]:
     from torchdyn_plan.training.train import networks
 
     fitted = [network for network in networks(task) if network not in task.policies]
-    forms = {network: _form(FitArguments, FITTED[network], task=_task_option(named)) for network in fitted}
+    static = _option(
+        str | None,
+        f"Static planner whose arrivals are learned, {task.default_static} when not given; folders carry its name.",
+        choices=task.static_planners,
+        default=None,
+    )
+    shared = {"task": _task_option(named), "static": static}
+    forms = {network: _form(FitArguments, FITTED[network], **shared) for network in fitted}
     for name, training in task.policies.items():
         options = _group(_plain(training.options))
         text = "How it learns: averaged takes the least time; the recipe's own way when not given, which is ddpg."

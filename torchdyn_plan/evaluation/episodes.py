@@ -15,6 +15,7 @@ from torchdyn_plan import keys
 from torchdyn_plan.envs.moving_target import MovingTargetEnv
 from torchdyn_plan.evaluation.results import NO_CAUSE, EpisodeOutcomes
 from torchdyn_plan.evaluation.traces import Trace, TraceLog
+from torchdyn_plan.progress import progress_bar
 from torchdyn_plan.tasks.task import Task, Truth, Verdict
 
 Planner = Callable[[TensorDictBase], TensorDictBase]
@@ -135,10 +136,11 @@ def play_all(
     Returns:
         How long it took [s].
     """
-    from tqdm import tqdm
-
     count, started, ended = len(log.done), time.perf_counter(), 0
-    with torch.no_grad(), tqdm(total=count, desc=name, unit="episode", leave=False, disable=not progress) as bar:
+    with (
+        torch.no_grad(),
+        progress_bar(total=count, desc=name, unit="episode", leave=False, disable=not progress) as bar,
+    ):
         for more in play(planner, env, log, future):
             bar.update(more)
             ended += more

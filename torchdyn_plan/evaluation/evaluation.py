@@ -7,11 +7,13 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from torchdyn_plan.checks import check_number
+from torchdyn_plan.checks import check_seed
+from torchdyn_plan.evaluation.identity import check_evaluation_folder, clear_results
 from torchdyn_plan.evaluation.plots import plot_results
 from torchdyn_plan.evaluation.report import format_table
 from torchdyn_plan.evaluation.results import EpisodeOutcomes, ResultRow, write_results
 from torchdyn_plan.evaluation.study import Planners, Study
+from torchdyn_plan.files import check_writable_folder
 from torchdyn_plan.planners import Delivery
 from torchdyn_plan.tasks.task import Task, load_task
 
@@ -32,13 +34,21 @@ class Evaluation:
         """The rows as text."""
         return format_table(self.task, self.rows)
 
-    def save(self, folder: str | Path) -> None:
+    def save(self, folder: str | Path, *, overwrite: bool = False) -> None:
         """Write ``results.json``, ``episodes.json`` and the plot ``results.png``.
 
+        Args:
+            folder: may hold the same evaluation already.
+            overwrite: take the place of whatever other results are there.
+
         Raises:
+            InputError: the folder holds a sweep, or results of something else.
             OutputError: the folder cannot be written to.
         """
         folder = Path(folder)
+        if overwrite:
+            clear_results(folder)
+        check_evaluation_folder(folder, self.config)
         write_results(folder, self.task, self.config, self.rows, self.outcomes)
         plot_results(self.task, self.rows, folder / "results.png")
 
@@ -56,6 +66,8 @@ def evaluate(
     delivery: Delivery | None = None,
     weights: str | Path | None = None,
     other_scene: bool = False,
+    out: str | Path | None = None,
+    overwrite: bool = False,
     progress: bool = True,
     **settings: Any,
 ) -> Evaluation:
@@ -75,16 +87,20 @@ def evaluate(
             none.
         weights: folder of the networks of named planners, as ``train`` leaves it; those that ship for None.
         other_scene: let planners of another scene play, too.
+        out: folder in which the results are saved as soon as they are there; it is looked at before anything runs.
+        overwrite: take the place of whatever other results are in that folder.
         progress: show progress bars.
         settings: of the task, by name; the others are at their defaults.
 
     Raises:
-        InputError: an unknown name, a number out of range, or a planner that belongs to another scene.
+        InputError: an unknown name, a number out of range, a planner that belongs to another scene, or a folder that
+            holds a sweep, or results of something else.
         WeightsError: weights are missing or damaged.
+        OutputError: the folder cannot be written to.
     """
     task = load_task(task)
     chosen = task.default_settings(**settings)
-    check_number("seed", seed, minimum=0, integer=True)
+    check_seed(seed)
     study = Study.of(
         task,
         planners,
@@ -98,6 +114,13 @@ def evaluate(
         num_threads=num_threads,
         progress=progress,
     )
-    outcomes = study.run(chosen, seed)
     config = study.config() | {"settings": dataclasses.asdict(chosen), "seed": seed}
-    return Evaluation(task=task, rows=study.summarize(chosen, outcomes), outcomes=outcomes, config=config)
+    if out is not None:
+        folder = check_writable_folder(Path(out))
+        if not overwrite:
+            check_evaluation_folder(folder, config)
+    outcomes = study.run(chosen, seed)
+    found = Evaluation(task=task, rows=study.summarize(chosen, outcomes), outcomes=outcomes, config=config)
+    if out is not None:
+        found.save(out, overwrite=overwrite)
+    return found

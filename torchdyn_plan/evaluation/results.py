@@ -6,15 +6,15 @@ import dataclasses
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
 import torch
 from torch import Tensor
 
-from torchdyn_plan.checks import check_writable_folder
 from torchdyn_plan.errors import InputError
 from torchdyn_plan.evaluation.intervals import rate
-from torchdyn_plan.files import write_json
+from torchdyn_plan.files import check_writable_folder, write_json
+from torchdyn_plan.schemas import Count, Least, check_content
 from torchdyn_plan.tasks.task import Settings, Task
 from torchdyn_plan.versions import library_versions, machine
 
@@ -77,12 +77,16 @@ class EpisodeOutcomes:
         A file does not tell evidence that is bool from flags: both are read as flags.
 
         Raises:
-            InputError: an entry is missing, or names a cause that ``task`` does not know.
+            InputError: an entry is missing, is of another kind, or names a cause that ``task`` does not know.
         """
-        own = {task.words.success, "steps", "replans", "solvable", "seconds"}
-        missing = sorted(own - set(content))
+        own = {task.words.success: list[bool], **_ENTRIES}
+        check_content(content, dict[str, Any], "episode outcomes")
+        missing = sorted(set(own) - set(content))
         if missing:
             raise InputError(f"episode outcomes lack {', '.join(missing)}")
+        for name, value in content.items():
+            schema = own.get(name, _CAUSES if name == "cause" else _OTHERS)
+            check_content(value, schema, "episode outcomes", entry=name)
         tensors = {name: torch.tensor(content[name]) for name in content if name not in {"cause", "seconds"}}
         others = {name: tensor for name, tensor in tensors.items() if name not in own}
         return cls(
@@ -102,6 +106,10 @@ class EpisodeOutcomes:
         """One after the other, as if they had been one run; their times add up."""
         names = ("success", "steps", "replans", "solvable", "cause")
         first = parts[0]
+        for part in parts:
+            if part.flags.keys() != first.flags.keys() or part.evidence.keys() != first.evidence.keys():
+                one, other = ([*part.flags, *part.evidence], [*first.flags, *first.evidence])
+                raise InputError(f"outcomes of one run tell of {', '.join(one)}, of another of {', '.join(other)}")
         return cls(
             **{name: torch.cat([getattr(part, name) for part in parts]) for name in names},
             flags={name: torch.cat([part.flags[name] for part in parts]) for name in first.flags},
@@ -109,6 +117,17 @@ class EpisodeOutcomes:
             causes=first.causes,
             seconds=sum(part.seconds for part in parts),
         )
+
+
+_ENTRIES = {
+    "steps": list[Annotated[int, Least(-1)]],
+    "replans": list[Count],
+    "solvable": list[bool],
+    "seconds": Annotated[float, Least(0.0)],
+}
+_CAUSES = list[str | None]
+_OTHERS = list[bool] | list[float]
+"""Entries of episode outcomes in a file, beside the task's success: those of every task, and flags and evidence."""
 
 
 def _codes(names: Sequence[str | None], causes: Sequence[str]) -> Tensor:

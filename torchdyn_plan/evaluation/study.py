@@ -5,14 +5,16 @@ from __future__ import annotations
 import dataclasses
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from functools import cached_property
 from pathlib import Path
 from typing import Any
 
-from torchdyn_plan.checks import check_choice, check_number
+from torchdyn_plan.checks import check_choice, check_count, check_threads
 from torchdyn_plan.errors import InputError
 from torchdyn_plan.evaluation.episodes import Planner, find_truth, run_episodes
 from torchdyn_plan.evaluation.results import EpisodeOutcomes, ResultRow, summarize
 from torchdyn_plan.planners import Delivery, DynamicPlanner
+from torchdyn_plan.planners.pretrained import planner_digest
 from torchdyn_plan.tasks.task import Settings, Task
 from torchdyn_plan.threads import one_thread
 
@@ -39,9 +41,9 @@ class Study:
     progress: bool = True
 
     def __post_init__(self) -> None:
-        check_number("episodes", self.episodes, minimum=1, integer=True)
-        check_number("num_envs", self.num_envs, minimum=1, integer=True)
-        check_number("num_threads", self.num_threads, minimum=0, integer=True)
+        check_count("episodes", self.episodes)
+        check_count("num_envs", self.num_envs)
+        check_threads("num_threads", self.num_threads)
         check_choice("split", self.split, SPLITS)
 
     @classmethod
@@ -101,7 +103,12 @@ class Study:
         counts = {name: getattr(self, name) for name in ("episodes", "split", "num_envs", "num_threads")}
         delivery = None if self.delivery is None else repr(self.delivery)
         about = {"task": self.task.name, "planners": list(self.planners), "static": self.static}
-        return about | counts | {"delivery": delivery, "scene": self.task.digest()}
+        return about | counts | {"delivery": delivery, "scene": self.task.digest(), "weights": dict(self.weights)}
+
+    @cached_property
+    def weights(self) -> Mapping[str, str | None]:
+        """What each planner is made of, its networks' tensors among it, in a few letters; None for a function."""
+        return {name: planner_digest(planner) for name, planner in self.planners.items()}
 
 
 def _make(task: Task, names: Sequence[str] | None, static: str, weights: str | Path | None) -> dict[str, Planner]:

@@ -3,24 +3,40 @@
 from __future__ import annotations
 
 import dataclasses
-import json
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, TypedDict
 
-from torchdyn_plan.checks import check_choice, check_number, check_writable_folder
+from torchdyn_plan.checks import check_choice, check_count, check_seed
 from torchdyn_plan.errors import InputError
+from torchdyn_plan.evaluation.identity import (
+    POINTS,
+    SWEEP,
+    check_sweep_folder,
+    clear_results,
+    digest_of,
+    identity_of,
+)
 from torchdyn_plan.evaluation.plots import plot_sweep
 from torchdyn_plan.evaluation.results import EpisodeOutcomes, ResultRow, write_results
 from torchdyn_plan.evaluation.study import Planners, Study
-from torchdyn_plan.files import write_json
+from torchdyn_plan.files import check_writable_folder, exists, read_json, short_path, write_json
 from torchdyn_plan.planners import Delivery
+from torchdyn_plan.progress import progress_bar
+from torchdyn_plan.schemas import check_content
 from torchdyn_plan.tasks.task import Settings, Task, load_task
-from torchdyn_plan.versions import library_versions
 
-_FREE = ("values", "repeats", "num_envs", "num_threads")
-"""What may differ when a sweep continues: it adds points, or does not change them."""
+
+class Point(TypedDict):
+    """One value and repeat in a file."""
+
+    identity: str
+    """Digest of what it is of."""
+    content: str
+    """Digest of the planners' outcomes: a file that was damaged does not have it."""
+    planners: dict[str, dict[str, Any]]
+    """How each planner's episodes ended."""
 
 
 def sweep(
@@ -40,6 +56,7 @@ def sweep(
     delivery: Delivery | None = None,
     weights: str | Path | None = None,
     other_scene: bool = False,
+    overwrite: bool = False,
     progress: bool = True,
     **settings: Any,
 ) -> list[ResultRow]:
@@ -63,6 +80,7 @@ def sweep(
         delivery: how plans come into use.
         weights: folder of the networks of named planners.
         other_scene: let planners of another scene play, too.
+        overwrite: remove whatever results are in the folder, points of this sweep among them.
         progress: show progress bars.
         settings: of the task, by name, but for the one that varies.
 
@@ -70,15 +88,15 @@ def sweep(
         A row for each value and planner, over the episodes of all repeats.
 
     Raises:
-        InputError: an unknown name, a number out of range, or the folder holds a sweep with another configuration or a
-            damaged point.
+        InputError: an unknown name, a number out of range, or the folder holds an evaluation, a sweep with another
+            configuration or a damaged point.
         WeightsError: weights are missing or damaged.
         OutputError: the folder cannot be written to.
     """
     task = load_task(task)
     check_choice(f"setting of {task.name} to sweep over", over, sweepable(task))
-    check_number("repeats", repeats, minimum=1, integer=True)
-    check_number("seed", seed, minimum=0, integer=True)
+    check_count("repeats", repeats, maximum=100_000)
+    check_seed(seed)
     base = task.default_settings(**settings)
     study = Study.of(
         task,
@@ -97,7 +115,7 @@ def sweep(
     if len(set(chosen)) < len(chosen):
         raise InputError(f"values must differ, got {' '.join(map(str, chosen))}")
     points = {value: dataclasses.replace(base, **{over: value}) for value in chosen}
-    return _Sweep(study, over, points, repeats, seed, check_writable_folder(Path(out))).run()
+    return _Sweep(study, over, points, repeats, seed, check_writable_folder(Path(out))).run(overwrite)
 
 
 def sweepable(task: Task) -> list[str]:
@@ -129,9 +147,12 @@ class _Sweep:
     seed: int
     out: Path
 
-    def run(self) -> list[ResultRow]:
+    def run(self, overwrite: bool) -> list[ResultRow]:
         """Run the points that the folder lacks, and put together all that were asked for."""
-        self._claim_folder()
+        if overwrite:
+            clear_results(self.out)
+        if not check_sweep_folder(self.out, self._identity()):
+            write_json(self.out / SWEEP, self._identity())
         self._run_missing_points()
         rows = [row for value in self.points for row in self._rows_at(value)]
         write_results(self.out, self.study.task, self._config(), rows)
@@ -144,57 +165,53 @@ class _Sweep:
         own = {"over": self.over, "values": list(self.points), "repeats": self.repeats, "seed": self.seed}
         return self.study.config() | {"settings": settings} | own
 
-    def _claim_folder(self) -> None:
-        """Write down what decides a point's outcome, or hold it against what the folder says already."""
-        path = self.out / "sweep.json"
-        identity = {name: value for name, value in self._config().items() if name not in _FREE}
-        # Each setting has a line of its own, to be named where it differs.
-        identity |= identity.pop("settings")
-        identity["version"] = library_versions()["torchdyn-plan"]
-        if not path.exists():
-            write_json(path, identity)
-            return
-        there = _read_json(path)
-        for name in (*identity, *there):
-            if there.get(name) != identity.get(name):
-                raise InputError(
-                    f"folder {str(self.out)!r} holds a sweep with another configuration: "
-                    f"{name} is {there.get(name)!r} there, {identity.get(name)!r} here"
-                )
+    def _identity(self) -> dict[str, Any]:
+        """What decides the outcome of every point."""
+        return identity_of(self._config())
+
+    def _digest(self, value: float, repeat: int) -> str:
+        """Which point it is, of which sweep."""
+        return digest_of(self._identity() | {self.over: value, "seed": self.seed + repeat})
 
     def _run_missing_points(self) -> None:
-        from tqdm import tqdm
-
-        missing = [point for point in self._all_points() if not self._path(*point).exists()]
+        missing = [point for point in self._all_points() if not exists(self._path(*point))]
         quiet = not (missing and self.study.progress)
-        for value, repeat in tqdm(missing, desc=f"sweep over {self.over}", unit="point", disable=quiet):
+        for value, repeat in progress_bar(missing, desc=f"sweep over {self.over}", unit="point", disable=quiet):
             outcomes = self.study.run(self.points[value], self.seed + repeat)
-            content = {planner: episodes.to_json(self.study.task) for planner, episodes in outcomes.items()}
-            write_json(self._path(value, repeat), content)
+            planners = {name: episodes.to_json(self.study.task) for name, episodes in outcomes.items()}
+            point = Point(identity=self._digest(value, repeat), content=digest_of(planners), planners=planners)
+            write_json(self._path(value, repeat), point)
 
     def _all_points(self) -> Iterator[tuple[float, int]]:
         """All values of a repeat before the next repeat, so that an early look at the folder shows the whole range."""
         return ((value, repeat) for repeat in range(self.repeats) for value in self.points)
 
     def _path(self, value: float, repeat: int) -> Path:
-        return self.out / "points" / f"{self.over}-{float(value)!r}-repeat-{repeat:02d}.json"
+        return self.out / POINTS / f"{self.over}-{float(value)!r}-repeat-{repeat:02d}.json"
 
     def _rows_at(self, value: float) -> list[ResultRow]:
         """A row for each planner at ``value``, over all repeats."""
-        repeats = [self._read_point(self._path(value, repeat)) for repeat in range(self.repeats)]
+        repeats = [self._read_point(value, repeat) for repeat in range(self.repeats)]
         merged = {name: EpisodeOutcomes.merge([point[name] for point in repeats]) for name in self.study.planners}
         return self.study.summarize(self.points[value], merged)
 
-    def _read_point(self, path: Path) -> dict[str, EpisodeOutcomes]:
+    def _read_point(self, value: float, repeat: int) -> dict[str, EpisodeOutcomes]:
+        """Outcomes by planner; raises `InputError` where the file is damaged, or of another point."""
+        path = self._path(value, repeat)
         try:
-            content = _read_json(path)
-            return {name: EpisodeOutcomes.from_json(content[name], self.study.task) for name in self.study.planners}
-        except (InputError, KeyError, TypeError, ValueError) as error:
-            raise InputError(f"point {str(path)!r} is damaged ({error}): delete it to run it again") from error
+            point: Point = check_content(read_json(path), Point, short_path(path))
+            if point["identity"] != self._digest(value, repeat):
+                raise InputError("it is of another sweep, or of another point")
+            if point["content"] != digest_of(point["planners"]):
+                raise InputError("it holds something else than was written")
+            return {name: self._outcomes(point, name) for name in self.study.planners}
+        except InputError as error:
+            raise InputError(f"point {short_path(path)} is damaged ({error}): delete it to run it again") from error
 
-
-def _read_json(path: Path) -> Any:
-    try:
-        return json.loads(path.read_text())
-    except ValueError as error:
-        raise InputError(f"{str(path)!r} is no JSON file: {error}") from error
+    def _outcomes(self, point: Point, name: str) -> EpisodeOutcomes:
+        if name not in point["planners"]:
+            raise InputError(f"it lacks planner {name!r}")
+        outcomes = EpisodeOutcomes.from_json(point["planners"][name], self.study.task)
+        if outcomes.episodes != self.study.episodes:
+            raise InputError(f"it has {outcomes.episodes} episodes of {name}, not {self.study.episodes}")
+        return outcomes

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 import torch
 from torch import Tensor, nn
 
-from torchdyn_plan.checks import check_number, network_input
+from torchdyn_plan.checks import check_count, check_number, network_input
 from torchdyn_plan.errors import InputError
 from torchdyn_plan.nets.forecast import DescribedForecast
 from torchdyn_plan.nets.pretrained import Pretrained
@@ -53,6 +53,7 @@ class ForecasterConfig:
         check_number("history", self.history, minimum=2, integer=True)
         for name in ("horizon", "channels", "convolutions", "hidden", "rank"):
             check_number(name, getattr(self, name), minimum=1, integer=True)
+        check_count("convolutions", self.convolutions, maximum=16)
         for name in ("step_scale", "length_scale", "height_scale", "change_scale"):
             check_number(name, getattr(self, name), minimum=1e-9)
         if self.half_extent is not None:

@@ -10,7 +10,7 @@ import torch
 from torch import Tensor, nn
 from torch.func import debug_unwrap
 
-from torchdyn_plan.checks import check_finite, check_number, network_input
+from torchdyn_plan.checks import check_count, check_finite, check_number, network_input
 from torchdyn_plan.errors import InputError
 from torchdyn_plan.nets.pretrained import Pretrained
 from torchdyn_plan.precision import Precise, autocast_is_on, without_autocast
@@ -39,6 +39,7 @@ class PolicyConfig:
     def __post_init__(self) -> None:
         for name in ("robot_state_size", "action_size", "hidden", "layers"):
             check_number(name, getattr(self, name), minimum=1, integer=True)
+        check_count("layers", self.layers, maximum=64)
         check_number("near", self.near, minimum=1e-6)
         object.__setattr__(self, "tool_slice", tuple(self.tool_slice))
         first, last = self.tool_slice

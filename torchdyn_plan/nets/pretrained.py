@@ -2,17 +2,17 @@
 
 import dataclasses
 import json
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any, ClassVar, Self
 
 import torch
-from safetensors import SafetensorError, safe_open
-from safetensors.torch import save_file
-from torch import nn
+from torch import Tensor, nn
 
+from torchdyn_plan.checks import check_finite
 from torchdyn_plan.errors import InputError, WeightsError
-from torchdyn_plan.files import write_whole
+from torchdyn_plan.files import is_file, open_tensors, parse_json, reason, short_path, write_tensors
+from torchdyn_plan.schemas import check_settings
 
 FORMAT = "torchdyn_plan.network.1"
 SHIPPED = Path(__file__).parent.parent / "weights"
@@ -28,25 +28,31 @@ class Pretrained:
     config: Any
 
     def save_pretrained(self, path: str | Path) -> Path:
-        """Write weights and configuration to one file, whole or not at all.
+        """Write weights and configuration to one file, whole or not at all; numbers as float32, whatever the network's.
 
         Args:
             path: a ``.safetensors`` file, or a folder, which gets ``<kind>.safetensors``.
 
         Returns:
-            The file written. Raises `OutputError` where it cannot be.
+            The file written.
+
+        Raises:
+            InputError: a weight is NaN or infinite, also as float32.
+            OutputError: the file cannot be written.
         """
         assert isinstance(self, nn.Module)
         file = Path(path)
         if file.suffix != ".safetensors":
             file = file / f"{self.kind}.safetensors"
-        tensors = {name: value.detach().cpu().contiguous() for name, value in self.state_dict().items()}
+        tensors = {name: _as_kept(value).cpu().contiguous() for name, value in self.state_dict().items()}
+        for name, value in tensors.items():
+            check_finite(f"{name} of {type(self).__name__}", value)
         metadata = {
             "format": FORMAT,
             "class": type(self).__name__,
             "config": json.dumps(dataclasses.asdict(self.config)),
         }
-        write_whole(file, lambda temporary: save_file(tensors, temporary, metadata))
+        write_tensors(file, tensors, metadata)
         return file
 
     @classmethod
@@ -54,21 +60,48 @@ class Pretrained:
         """Network of this class from a name that ships, a file, or a folder of `save_pretrained` or of a training.
 
         Raises:
-            WeightsError: no such name or file; or a file that is truncated or holds another network.
+            WeightsError: no such name or file; or a file that is truncated, holds another network, or weights that are
+                no finite float32 numbers. Nothing is allocated before the file's header has been found to fit.
         """
         file = cls.find(name_or_path)
-        metadata, tensors = _read(file)
-        if metadata.get("format") != FORMAT or metadata.get("class") != cls.__name__:
-            found = metadata.get("class") or "no network of this package"
-            raise WeightsError(f"{str(file)!r} holds {found}, expected {cls.__name__}")
-        try:
-            build: Any = cls
-            network = build(cls.config_type(**json.loads(metadata["config"])))
-        except (KeyError, TypeError, json.JSONDecodeError, InputError) as error:
-            raise WeightsError(f"{str(file)!r} has an invalid configuration of {cls.__name__}: {error}") from error
-        _check_tensors(file, network.state_dict(), tensors)
+        build: Any = cls
+        with open_tensors(file, WeightsError) as content:
+            config = cls._read_config(file, content.metadata() or {})
+            found = {name: content.get_slice(name) for name in content.keys()}  # noqa: SIM118
+            _check_header(file, cls._expected(file, config), found)
+            tensors = {name: content.get_tensor(name) for name in found}
+        for name, tensor in tensors.items():
+            if not bool(torch.isfinite(tensor).all()):
+                raise WeightsError(f"{short_path(file)}: tensor {name!r} holds NaN or infinite values")
+        network = build(config)
         network.load_state_dict(tensors)
         return network.to(device).eval()
+
+    @classmethod
+    def _read_config(cls, file: Path, metadata: Mapping[str, str]) -> Any:
+        """Configuration in the file's ``metadata``; raises `WeightsError` where it is none of this network."""
+        if metadata.get("format") != FORMAT or metadata.get("class") != cls.__name__:
+            found = metadata.get("class") or "no network of this package"
+            raise WeightsError(f"{short_path(file)} holds {found}, expected {cls.__name__}")
+        try:
+            settings = check_settings(parse_json(metadata["config"]), cls.config_type, "config", InputError)
+            return cls.config_type(**settings)
+        except (KeyError, TypeError, ValueError) as error:
+            raise cls._invalid(file, error) from error
+
+    @classmethod
+    def _expected(cls, file: Path, config: Any) -> dict[str, Tensor]:
+        """Tensors of the network with this configuration, on no device: they take no memory."""
+        build: Any = cls
+        try:
+            with torch.device("meta"):
+                return build(config).state_dict()
+        except (RuntimeError, TypeError, ValueError, OverflowError, MemoryError) as error:
+            raise cls._invalid(file, error) from error
+
+    @classmethod
+    def _invalid(cls, file: Path, error: Exception) -> WeightsError:
+        return WeightsError(f"{short_path(file)} has an invalid configuration of {cls.__name__}: {reason(error)}")
 
     @classmethod
     def find(cls, name_or_path: str | Path) -> Path:
@@ -77,29 +110,35 @@ class Pretrained:
         file = f"{cls.kind}.safetensors"
         choices = (path, path / file, path / cls.kind / file, SHIPPED / f"{cls.kind}-{name_or_path}.safetensors")
         for choice in choices:
-            if choice.is_file():
+            if is_file(choice):
                 return choice
         names = sorted(file.stem.removeprefix(f"{cls.kind}-") for file in SHIPPED.glob(f"{cls.kind}-*.safetensors"))
         raise WeightsError(
-            f"no weights {str(name_or_path)!r} for {cls.__name__}: neither a file or folder, nor one of the names that "
+            f"no weights {short_path(path)} for {cls.__name__}: neither a file or folder, nor one of the names that "
             f"ship ({', '.join(names) or 'none'})"
         )
 
 
-def _read(file: Path) -> tuple[dict[str, str], dict[str, torch.Tensor]]:
-    try:
-        with safe_open(file, framework="pt") as content:
-            return content.metadata() or {}, {name: content.get_tensor(name) for name in content.keys()}  # noqa: SIM118
-    except (SafetensorError, OSError) as error:
-        raise WeightsError(f"{str(file)!r} is not a whole safetensors file: {error}") from error
+def _as_kept(tensor: Tensor) -> Tensor:
+    """``tensor`` as files hold it."""
+    return tensor.detach().float() if tensor.is_floating_point() else tensor.detach()
 
 
-def _check_tensors(file: Path, expected: dict[str, torch.Tensor], found: dict[str, torch.Tensor]) -> None:
+def _check_header(file: Path, expected: Mapping[str, Tensor], found: Mapping[str, Any]) -> None:
+    """Raise `WeightsError` unless the tensors that are ``found`` in the header have the expected names and kinds."""
     for name in sorted(expected.keys() | found.keys()):
         if name not in found:
-            raise WeightsError(f"{str(file)!r} lacks the tensor {name!r}")
+            raise WeightsError(f"{short_path(file)} lacks the tensor {name!r}")
         if name not in expected:
-            raise WeightsError(f"{str(file)!r} has a foreign tensor {name!r}")
-        if found[name].shape != expected[name].shape:
-            shapes = f"{tuple(found[name].shape)}, expected {tuple(expected[name].shape)}"
-            raise WeightsError(f"{str(file)!r}: tensor {name!r} has shape {shapes}")
+            raise WeightsError(f"{short_path(file)} has a foreign tensor {name!r}")
+        shape = tuple(found[name].get_shape())
+        if shape != tuple(expected[name].shape):
+            shapes = f"{shape}, expected {tuple(expected[name].shape)}"
+            raise WeightsError(f"{short_path(file)}: tensor {name!r} has shape {shapes}")
+        kept = _KINDS.get(_as_kept(torch.empty(0, dtype=expected[name].dtype)).dtype)
+        if found[name].get_dtype() != kept:
+            raise WeightsError(f"{short_path(file)}: tensor {name!r} is {found[name].get_dtype()}, expected {kept}")
+
+
+_KINDS = {torch.float32: "F32", torch.int64: "I64", torch.int32: "I32", torch.bool: "BOOL"}
+"""How files call the types of tensors."""

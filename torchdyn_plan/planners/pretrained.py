@@ -3,21 +3,32 @@
 from __future__ import annotations
 
 import dataclasses
+import hashlib
 import importlib
 import json
 import math
 import sys
 from collections.abc import Callable, Mapping
 from pathlib import Path
-from typing import Any, Protocol, Self, runtime_checkable
+from typing import Any, Protocol, Self, TypedDict, runtime_checkable
 
 import torch
 from torch import Tensor
 
-from torchdyn_plan.checks import check_choice, check_writable_folder
+from torchdyn_plan.checks import check_choice
 from torchdyn_plan.errors import InputError, WeightsError
-from torchdyn_plan.files import write_json, write_whole
+from torchdyn_plan.files import (
+    check_writable_folder,
+    is_file,
+    is_folder,
+    no_empty_folders,
+    read_json,
+    short_path,
+    write_json,
+    write_whole,
+)
 from torchdyn_plan.nets.pretrained import SHIPPED, Pretrained
+from torchdyn_plan.schemas import check_content
 from torchdyn_plan.versions import library_versions
 
 FORMAT = "torchdyn_plan.planner.1"
@@ -46,19 +57,11 @@ class PretrainedPlanner:
         Returns:
             The JSON file. Raises `OutputError` where it cannot be written.
         """
-        folder = check_writable_folder(Path(folder))
-        written: dict[int, str] = {}
-
-        def save(network: Pretrained) -> str:
-            if id(network) not in written:
-                count = sum(name.startswith(network.kind) for name in written.values())
-                written[id(network)] = f"{network.kind}{count + 1 if count else ''}.safetensors"
-                network.save_pretrained(folder / written[id(network)])
-            return written[id(network)]
-
-        content = describe_planner(self, save)
-        write_json(folder / FILE, content)
-        write_whole(folder / "planner.md", lambda file: file.write_text(_card(content)))
+        folder, written = Path(folder), {}
+        with no_empty_folders(folder):
+            content = describe_planner(self, lambda network: _save(network, check_writable_folder(folder), written))
+            write_json(folder / FILE, content)
+            write_whole(folder / "planner.md", lambda file: file.write_text(_card(content), encoding="utf-8"))
         return folder / FILE
 
     @classmethod
@@ -88,11 +91,21 @@ class PretrainedPlanner:
         made = {name: parts[name] if name in parts else load.part(name, value) for name, value in described.items()}
         try:
             planner: Any = cls(**made)
-        except (TypeError, InputError) as error:
+        except (TypeError, ValueError, AttributeError, RuntimeError) as error:
             if isinstance(error, InputError) and parts:
                 raise
             raise WeightsError(f"{str(file)!r} describes no planner that can be made: {error}") from error
         return _ready(planner.to(device), parts)
+
+
+def _save(network: Pretrained, folder: Path, written: dict[int, str]) -> str:
+    """Write ``network`` into ``folder`` unless it was ``written`` already; returns the name of its file."""
+    if id(network) not in written:
+        count = sum(name.startswith(network.kind) for name in written.values())
+        name = f"{network.kind}{count + 1 if count else ''}.safetensors"
+        network.save_pretrained(folder / name)
+        written[id(network)] = name
+    return written[id(network)]
 
 
 def shipped_planners() -> list[str]:
@@ -113,6 +126,22 @@ def describe_planner(planner: Any, save: Callable[[Pretrained], str]) -> dict[st
     """``planner`` as JSON; ``save`` stores a network and returns the name of its file."""
     parts = {name: _describe(value, save) for name, value in planner.part_settings().items()}
     return {"format": FORMAT, "class": _path_of(type(planner)), "parts": parts}
+
+
+def planner_digest(planner: Any) -> str | None:
+    """A few letters that tell planners apart by their parts, settings and tensors; None for a bare function."""
+    if not isinstance(planner, torch.nn.Module):
+        return None
+    told = hashlib.sha256()
+    for module in planner.modules():
+        settings = (
+            describe_planner(module, lambda network: repr(network.config)) if hasattr(module, "part_settings") else None
+        )
+        told.update(f"{_path_of(type(module))} {json.dumps(settings, sort_keys=True)}".encode())
+    for name, tensor in planner.state_dict().items():
+        told.update(f"{name} {tensor.dtype} {tuple(tensor.shape)}".encode())
+        told.update(tensor.detach().cpu().contiguous().view(-1).view(torch.uint8).numpy().tobytes())
+    return told.hexdigest()[:16]
 
 
 def _describe(value: Any, save: Callable[[Pretrained], str]) -> Any:
@@ -159,7 +188,7 @@ class _Loader:
         """The part ``name``; raises `WeightsError` where it cannot be made."""
         try:
             return self.restore(value)
-        except (KeyError, TypeError, ValueError, AttributeError, ImportError) as error:
+        except (KeyError, TypeError, ValueError, AttributeError, ImportError, RuntimeError, OverflowError) as error:
             if isinstance(error, WeightsError):
                 raise WeightsError(f"{name} of {str(self.file)!r}: {error}") from error
             raise WeightsError(f"{name} of {str(self.file)!r} cannot be made: {error!r}") from error
@@ -209,22 +238,26 @@ def _path_of(kind: type) -> str:
 def _find(name_or_folder: str | Path) -> Path:
     choices = (Path(name_or_folder) / FILE, SHIPPED / f"planner-{name_or_folder}.json")
     for choice in choices:
-        if choice.is_file():
+        if is_file(choice):
             return choice
-    if Path(name_or_folder).is_dir():
+    if is_folder(Path(name_or_folder)):
         raise InputError(f"folder {str(name_or_folder)!r} holds no planner: no {FILE}, as save_pretrained writes it")
     check_choice("planner", str(name_or_folder), shipped_planners())
     raise AssertionError("a planner that ships was not found")
 
 
+class _Described(TypedDict):
+    """What is read back of ``planner.json``."""
+
+    format: str
+    parts: dict[str, Any]
+
+
 def _read(file: Path) -> dict[str, Any]:
-    try:
-        content = json.loads(file.read_text())
-        if content["format"] != FORMAT or not isinstance(content["parts"], dict):
-            raise KeyError("format")
-    except (OSError, ValueError, KeyError, TypeError) as error:
-        raise WeightsError(f"{str(file)!r} describes no planner of this package: {error!r}") from error
-    return content
+    content = read_json(file, WeightsError)
+    if not isinstance(content, dict) or content.get("format") != FORMAT:
+        raise WeightsError(f"{short_path(file)} describes no planner of this package")
+    return check_content(content, _Described, short_path(file), WeightsError)
 
 
 def _card(content: Mapping[str, Any]) -> str:

@@ -8,7 +8,7 @@ from torch import Tensor
 
 from torchdyn_plan.checks import check_finite, check_trailing_shape
 from torchdyn_plan.errors import InputError
-from torchdyn_plan.training.windows import read_shards
+from torchdyn_plan.training.shards import read_shards
 
 
 class Arrivals(NamedTuple):
@@ -37,6 +37,8 @@ def load_arrivals(folder: Path, *, state_size: int | None = None) -> Arrivals:
     shards = read_shards(folder, "arrivals", Arrivals._fields)
     data = Arrivals(*(torch.cat([shard[name] for shard in shards]) for name in Arrivals._fields))
     check_trailing_shape("goal", data.goal, 3)
+    if data.arrival.dtype != torch.int64 or data.run.dtype != torch.int64 or bool((data.arrival < -1).any()):
+        raise InputError(f"arrival and run in {str(folder)!r} must be whole numbers, arrivals from -1 upwards")
     if state_size is not None:
         check_trailing_shape("robot_state of the arrivals", data.robot_state, state_size)
     for name, tensor in zip(Arrivals._fields, data, strict=True):

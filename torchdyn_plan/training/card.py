@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict
 from pathlib import Path
@@ -10,7 +9,6 @@ from typing import TYPE_CHECKING, Any
 
 import torch
 
-from torchdyn_plan.errors import InputError
 from torchdyn_plan.files import write_json, write_whole
 from torchdyn_plan.versions import library_versions, machine
 
@@ -23,33 +21,6 @@ if TYPE_CHECKING:
 Rows = list[dict[str, Any]]
 Tables = dict[str, Rows]
 """Rows of figures by caption."""
-
-
-def read_description(data: Path, stem: str, *, scene: str) -> dict[str, Any]:
-    """What ``data`` says of its ``stem-*.safetensors``: ``data``, arguments of each collection, and ``scene``.
-
-    Args:
-        data: folder of `torchdyn_plan.training.collect`.
-        stem: ``paths`` or ``arrivals``.
-        scene: digest of the scene that the data must come from.
-
-    Raises:
-        InputError: there is no description, it is broken, or it tells of another scene.
-    """
-    files = sorted(Path(data).glob(f"{stem}-*.json"))
-    if not files:
-        raise InputError(f"no {stem}-*.json in {str(data)!r}: its collection did not finish")
-    arguments = []
-    for file in files:
-        try:
-            about = json.loads(file.read_text())
-            arguments.append(about["arguments"])
-            found = about["scene"]
-        except (OSError, ValueError, KeyError, TypeError) as error:
-            raise InputError(f"{str(file)!r} is no description of collected data: {error!r}") from error
-        if found != scene:
-            raise InputError(f"{str(file)!r} tells of scene {found}, but the scene is {scene}: collect the data again")
-    return {"data": arguments, "scene": scene}
 
 
 def write_network(

@@ -1,18 +1,31 @@
 """Where a fit stands, in one file: tensors in safetensors, scalars and settings as JSON in its metadata."""
 
+import hashlib
 import json
+from collections.abc import Mapping
 from pathlib import Path
-from typing import Any
+from typing import Any, TypedDict
 
 import torch
-from safetensors import SafetensorError, safe_open
-from safetensors.torch import save_file
 from torch import Tensor, nn
 
 from torchdyn_plan.errors import TrainingError
-from torchdyn_plan.files import write_whole
+from torchdyn_plan.files import parse_json, read_tensors, reason, short_path, write_tensors
+from torchdyn_plan.schemas import check_content
 
-FORMAT = "torchdyn_plan.checkpoint.1"
+FORMAT = "torchdyn_plan.checkpoint.2"
+
+
+class About(TypedDict):
+    """Metadata of a checkpoint."""
+
+    format: str
+    settings: str
+    """JSON."""
+    progress: str
+    """JSON."""
+    digest: str
+    """Of all the rest: a file that was damaged does not have it."""
 
 
 def save_checkpoint(
@@ -45,8 +58,8 @@ def write_checkpoint(
 ) -> None:
     """Write ``tensors``, JSON ``settings`` and JSON ``progress`` to ``file``, whole or not at all."""
     tensors = {name: value.detach().cpu().contiguous() for name, value in tensors.items()}
-    metadata = {"format": FORMAT, "settings": json.dumps(settings), "progress": json.dumps(progress)}
-    write_whole(file, lambda temporary: save_file(tensors, temporary, metadata))
+    about = {"format": FORMAT, "settings": json.dumps(settings), "progress": json.dumps(progress)}
+    write_tensors(file, tensors, about | {"digest": _digest(about, tensors)})
 
 
 def load_checkpoint(
@@ -56,13 +69,14 @@ def load_checkpoint(
     generator: torch.Generator,
     *,
     settings: dict[str, Any],
-) -> dict[str, Any]:
-    """Put network, optimiser and generator back where ``file`` has them; returns its progress.
+    schema: Any = dict[str, Any],
+) -> Any:
+    """Put network, optimiser and generator back where ``file`` has them; returns its progress, as ``schema`` says.
 
     Raises:
         TrainingError: the file is damaged, or was made with other ``settings``, of which the first is named.
     """
-    tensors, progress = read_checkpoint(file, settings=settings)
+    tensors, progress = read_checkpoint(file, settings=settings, schema=schema)
     try:
         network.load_state_dict(group(tensors, "network"))
         states: dict[int, dict[str, Tensor]] = {}
@@ -71,38 +85,52 @@ def load_checkpoint(
             states.setdefault(int(index), {})[entry] = value
         optimiser.load_state_dict({"state": states, "param_groups": optimiser.state_dict()["param_groups"]})
         generator.set_state(tensors["generator"])
-    except (KeyError, ValueError, RuntimeError) as error:
-        raise TrainingError(f"checkpoint {str(file)!r} does not fit this network: {error}") from error
+    except (KeyError, ValueError, RuntimeError, TypeError) as error:
+        raise TrainingError(f"checkpoint {short_path(file)} does not fit this network: {reason(error)}") from error
     return progress
 
 
-def read_checkpoint(file: Path, *, settings: dict[str, Any]) -> tuple[dict[str, Tensor], dict[str, Any]]:
-    """Tensors and progress in ``file``.
+def read_checkpoint(
+    file: Path, *, settings: dict[str, Any], schema: Any = dict[str, Any]
+) -> tuple[dict[str, Tensor], Any]:
+    """Tensors in ``file``, and its progress, as ``schema`` says.
 
     Raises:
         TrainingError: the file is damaged, or was made with other ``settings``, of which the first is named.
     """
-    metadata, tensors = _read(file)
-    try:
-        found, progress = json.loads(metadata["settings"]), json.loads(metadata["progress"])
-    except (KeyError, ValueError) as error:
-        raise TrainingError(f"checkpoint {str(file)!r} does not tell how it was made: {error}") from error
-    _check_settings(file, settings, found)
-    return tensors, progress
-
-
-def _read(file: Path) -> tuple[dict[str, str], dict[str, Tensor]]:
-    try:
-        with safe_open(file, framework="pt") as content:
-            metadata = content.metadata() or {}
-            tensors = {name: content.get_tensor(name) for name in content.keys()}  # noqa: SIM118
-    except (SafetensorError, OSError) as error:
-        raise TrainingError(
-            f"checkpoint {str(file)!r} is damaged ({error}): delete it or train without resume"
-        ) from error
+    metadata, tensors = read_tensors(file, _DamagedError)
     if metadata.get("format") != FORMAT:
-        raise TrainingError(f"{str(file)!r} is no checkpoint of this package: delete it or train without resume")
-    return metadata, tensors
+        raise TrainingError(f"{short_path(file)} is no checkpoint of this package: {REMEDY}")
+    where = short_path(file)
+    about: About = check_content(metadata, About, where, _DamagedError)
+    if about["digest"] != _digest(metadata, tensors):
+        raise _DamagedError(f"{where} holds something else than was written")
+    try:
+        found, progress = parse_json(about["settings"]), parse_json(about["progress"])
+    except ValueError as error:
+        raise _DamagedError(f"{where} does not tell how it was made: {reason(error)}") from error
+    _check_settings(file, settings, check_content(found, dict[str, Any], where, _DamagedError, entry="settings"))
+    return tensors, check_content(progress, schema, where, _DamagedError, entry="progress")
+
+
+REMEDY = "delete it or train without resume"
+
+
+class _DamagedError(TrainingError):
+    """A checkpoint cannot be gone on from."""
+
+    def __init__(self, text: str) -> None:
+        super().__init__(f"damaged checkpoint: {text}: {REMEDY}")
+
+
+def _digest(metadata: Mapping[str, str], tensors: Mapping[str, Tensor]) -> str:
+    told = hashlib.sha256()
+    for name in ("format", "settings", "progress"):
+        told.update(f"{name} {metadata[name]} ".encode())
+    for name, tensor in sorted(tensors.items()):
+        told.update(f"{name} {tensor.dtype} {tuple(tensor.shape)} ".encode())
+        told.update(tensor.reshape(-1).view(torch.uint8).numpy().data)
+    return told.hexdigest()
 
 
 def group(tensors: dict[str, Tensor], prefix: str) -> dict[str, Tensor]:
@@ -115,6 +143,6 @@ def _check_settings(file: Path, expected: dict[str, Any], found: dict[str, Any])
     for name in sorted(expected.keys() | found.keys()):
         if expected.get(name) != found.get(name):
             raise TrainingError(
-                f"checkpoint {str(file)!r} was made with {name} {found.get(name)!r}, not {expected.get(name)!r}: "
+                f"checkpoint {short_path(file)} was made with {name} {found.get(name)!r}, not {expected.get(name)!r}: "
                 "give the same, another folder, or train without resume"
             )

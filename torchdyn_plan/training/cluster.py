@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from functools import partial
+from importlib.util import find_spec
 from typing import Any
 
 import torch
@@ -51,6 +52,8 @@ class ClusterDDPG(DDPG):
         """
         if workers < 1 or recipe.num_envs % workers:
             raise InputError(f"workers must divide num_envs {recipe.num_envs} evenly, got {workers}")
+        if find_spec("ray") is None:
+            raise InputError("workers need Ray: pip install 'torchdyn-plan[ray]'")
         self.workers = workers
         self.cluster = cluster or {"num_cpus": workers, "include_dashboard": False, "log_to_driver": False}
         super().__init__(task, recipe, device=device)

@@ -9,21 +9,20 @@ from pathlib import Path
 from typing import Any
 
 import torch
-from safetensors import SafetensorError, safe_open
-from safetensors.torch import save_file
 from torch import Tensor
 
-from torchdyn_plan.checks import check_choice, check_number
+from torchdyn_plan.checks import check_choice, check_count, check_seed, check_threads
 from torchdyn_plan.errors import InputError
-from torchdyn_plan.files import write_json, write_whole
+from torchdyn_plan.files import exists, short_path, write_json, write_tensors
 from torchdyn_plan.nets.policy import Actor
 from torchdyn_plan.planners import PolicyPlanner, StaticPlanner
+from torchdyn_plan.progress import progress_bar
 from torchdyn_plan.tasks.task import Task, load_task
 from torchdyn_plan.threads import one_thread
+from torchdyn_plan.training import shards
+from torchdyn_plan.training.shards import check_made, shard_path, shard_sizes, surplus_shards
 from torchdyn_plan.versions import library_versions
 
-SHARD = {"paths": 1024, "arrivals": 2048}
-"""Episodes in a shard of each kind of data; of arrivals, sequences of runs."""
 ENTRIES = {
     "paths": ("positions", "start", "length", "pocketed", "velocity"),
     "arrivals": ("robot_state", "goal", "arrival", "run"),
@@ -68,24 +67,27 @@ def collect(
         WeightsError: there are no such weights.
         OutputError: the folder cannot be written to.
     """
-    from tqdm import tqdm
-
     task = load_task(task)
-    check_choice("kind of data", what, SHARD)
+    check_choice("kind of data", what, shards.SHARD)
     if weights is not None and (what != "arrivals" or planner is not None):
         raise InputError(f"weights are of the task's own static planner, whose arrivals are measured, got {weights}")
     driver = name if planner is not None else static or task.default_static
     file = None if weights is None else str(Actor.find(weights))
     wanted = _Wanted(task.name, what, str(out), episodes, seed, num_envs, num_threads, driver, file)
+    for surplus in surplus_shards(out, what, seed, wanted.shards):
+        raise InputError(
+            f"{short_path(surplus)} lies beyond the {episodes} episodes asked for: ask for as many as there are, or "
+            "delete it"
+        )
     with one_thread():
         record = _recorder(task, wanted, planner)
-        for index in tqdm(range(wanted.shards), desc=f"collect {what}", unit="shard"):
-            path = out / f"{what}-{seed}-{index:03d}.safetensors"
+        for index in progress_bar(range(wanted.shards), desc=f"collect {what}", unit="shard"):
+            path = shard_path(out, what, seed, index)
             made = wanted.metadata(index, task.digest())
-            if path.exists() and _is_kept(path, made):
+            if exists(path) and not check_made(path, made):
                 continue
             tensors = _whole(wanted, record(index))
-            write_whole(path, lambda temporary, tensors=tensors, made=made: save_file(tensors, temporary, made))
+            write_tensors(path, tensors, made)
     about = {"arguments": asdict(wanted), "scene": task.digest(), "versions": library_versions()}
     write_json(out / f"{what}-{seed}.json", about)
 
@@ -105,17 +107,19 @@ class _Wanted:
     weights: str | None = None
 
     def __post_init__(self) -> None:
-        for name, minimum in (("episodes", 1), ("num_envs", 1), ("seed", 0), ("num_threads", 0)):
-            check_number(name, getattr(self, name), minimum=minimum, integer=True)
+        check_count("episodes", self.episodes)
+        check_count("num_envs", self.num_envs)
+        check_seed(self.seed)
+        check_threads("num_threads", self.num_threads)
 
     @property
     def shards(self) -> int:
         """How many shards there are."""
-        return -(-self.episodes // SHARD[self.what])
+        return len(shard_sizes(self.what, self.episodes))
 
     def blocks(self, index: int) -> list[Tensor]:
         """Episode numbers of a shard, ``num_envs`` at a time."""
-        size = SHARD[self.what]
+        size = shards.SHARD[self.what]
         last = min((index + 1) * size, self.episodes)
         starts = range(index * size, last, self.num_envs)
         return [torch.arange(first, min(first + self.num_envs, last)) for first in starts]
@@ -165,19 +169,3 @@ def _whole(wanted: _Wanted, tensors: Mapping[str, Tensor]) -> dict[str, Tensor]:
     if missing:
         raise InputError(f"what {wanted.task} records of {wanted.what} lacks {', '.join(missing)}")
     return {name: value.contiguous() for name, value in tensors.items()}
-
-
-def _is_kept(path: Path, made: dict[str, str]) -> bool:
-    """Whether the shard at ``path`` is as it would be ``made``; not one that another number of episodes cut short."""
-    try:
-        with safe_open(path, framework="pt") as content:
-            there = content.metadata() or {}
-    except (SafetensorError, OSError) as error:
-        raise InputError(f"{str(path)!r} is not a whole safetensors file: {error}") from error
-    differing = [name for name in made if there.get(name, made[name]) != made[name]]
-    for name in differing:
-        if name != "episodes":
-            raise InputError(
-                f"{str(path)!r} is of another collection: {name} is {there[name]} there, {made[name]} here"
-            )
-    return not differing

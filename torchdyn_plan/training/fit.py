@@ -19,16 +19,18 @@ from torch import Tensor
 from torch.nn.functional import cross_entropy
 
 from torchdyn_plan.errors import InputError
+from torchdyn_plan.files import short_path
 from torchdyn_plan.nets.eta import ETAConfig, ETANetwork, arrival_classes
 from torchdyn_plan.nets.forecaster import Forecaster, ForecasterConfig
 from torchdyn_plan.tasks.task import Task
 from torchdyn_plan.training.arrival_data import load_arrivals, split_groups
-from torchdyn_plan.training.card import Tables, read_description, write_network
+from torchdyn_plan.training.card import Tables, write_network
 from torchdyn_plan.training.fitting import Fitting
 from torchdyn_plan.training.lines import unreflect_paths
 from torchdyn_plan.training.metrics import arrival_errors, forecast_errors, lost_accuracy
 from torchdyn_plan.training.optimise import Recipe, optimise
 from torchdyn_plan.training.path_data import PathSamples
+from torchdyn_plan.training.shards import read_description
 from torchdyn_plan.training.windows import Windows
 
 ROWS = 4096
@@ -111,15 +113,19 @@ def fit_eta(
     recipe: Recipe | None = None,
     *,
     config: ETAConfig | None = None,
+    static: str | None = None,
     resume: bool = True,
 ) -> Path:
     """Fit an `ETANetwork` to the ``arrivals`` in ``data``; one in ten runs is held out and scored.
 
-    ``config`` is the task's by default; without ``resume`` a checkpoint in ``out`` is not continued.
+    ``config`` is the task's by default; data of another static planner than ``static`` are refused, unless it is None;
+    without ``resume`` a checkpoint in ``out`` is not continued.
     """
     fitting = task_fitting(task)
     config, recipe = config or fitting.eta, recipe or fitting.recipe("eta")
     about = read_description(data, "arrivals", scene=task.digest())
+    if static not in (None, about["static"]):
+        raise InputError(f"arrivals in {short_path(Path(data))} are of {about['static']}, not of {static}")
     samples = load_arrivals(data, state_size=config.robot_state_size)
     train, held = (samples.take(rows) for rows in split_groups(samples.run, recipe.seed))
     device = recipe.device
@@ -142,7 +148,8 @@ def fit_eta(
         rows = arrival_errors(logits, held.arrival, groups, bin_width=config.bin_width)
         return {"Errors on held-out runs [control steps]": rows}
 
-    settings = {"network": asdict(config), "scene": about["scene"], "samples": len(samples.run)}
+    driver = {name: about[name] for name in ("static", "weights") if name in about}
+    settings = {"network": asdict(config), "scene": about["scene"], "samples": len(samples.run)} | driver
     folder = out / ETANetwork.kind
     optimise(network, loss, lambda: _arrival_figures(score()), recipe, out=folder, settings=settings, resume=resume)
     counts = {"samples": len(samples.run), "held out": len(held.run)}

@@ -14,12 +14,13 @@ from torchdyn_plan.errors import InputError
 from torchdyn_plan.nets.forecaster import Forecaster
 from torchdyn_plan.nets.spread import Spread, SpreadConfig, SpreadNetwork
 from torchdyn_plan.tasks.task import Task
-from torchdyn_plan.training.card import Rows, Tables, read_description, write_network
+from torchdyn_plan.training.card import Rows, Tables, write_network
 from torchdyn_plan.training.fit import task_fitting
 from torchdyn_plan.training.fitting import Fitting
 from torchdyn_plan.training.metrics import coverage, lost_probability
 from torchdyn_plan.training.optimise import Recipe, optimise
 from torchdyn_plan.training.path_data import PathSamples
+from torchdyn_plan.training.shards import read_description
 from torchdyn_plan.training.windows import Windows
 
 ROWS = 1024

@@ -5,14 +5,17 @@ import time
 from collections.abc import Callable
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, TypedDict
 
 import torch
 from torch import Tensor, nn
 
-from torchdyn_plan.checks import check_device, check_number
+from torchdyn_plan.checks import check_device, check_number, check_seed
 from torchdyn_plan.errors import TrainingError
-from torchdyn_plan.files import write_json
+from torchdyn_plan.files import exists, write_json
+from torchdyn_plan.progress import progress_bar
+from torchdyn_plan.schemas import Count
+from torchdyn_plan.stopping import stop_when_safe
 from torchdyn_plan.training.checkpoint import load_checkpoint, save_checkpoint
 
 
@@ -44,7 +47,7 @@ class Recipe:
     def __post_init__(self) -> None:
         for name in ("steps", "batch", "validations"):
             check_number(name, getattr(self, name), minimum=1, integer=True)
-        check_number("seed", self.seed, minimum=0, integer=True)
+        check_seed(self.seed)
         check_number("lr", self.lr, minimum=1e-9)
         check_number("clip", self.clip, minimum=1e-9)
         check_number("warmup_share", self.warmup_share, minimum=0.0, maximum=1.0)
@@ -62,6 +65,17 @@ class Recipe:
     def is_validated(self, step: int) -> bool:
         """Whether the held-out share is scored after ``step`` steps."""
         return step == self.steps or step % max(1, self.steps // self.validations) == 0
+
+
+class Progress(TypedDict):
+    """Where a fit stands, beside its tensors."""
+
+    step: Count
+    total: float
+    """Sum of the losses since the curve's last entry."""
+    counted: Count
+    """How many these are."""
+    curve: list[dict[str, float]]
 
 
 def optimise(
@@ -117,19 +131,18 @@ class _Descent:
         self.step, self.total, self.counted, self.curve = 0, 0.0, 0, []
 
     def run(self, resume: bool) -> list[dict[str, float]]:
-        from tqdm import tqdm
-
-        if resume and self.file.exists():
+        if resume and exists(self.file):
             self.restore()
         saved = time.monotonic()
-        with tqdm(total=self.recipe.steps, initial=self.step, desc=f"fit {self.file.parent.name}", unit="step") as bar:
-            while self.step < self.recipe.steps:
+        about: Any = {"total": self.recipe.steps, "initial": self.step, "desc": f"fit {self.file.parent.name}"}
+        with stop_when_safe() as stopping, progress_bar(unit="step", **about) as bar:
+            while self.step < self.recipe.steps and not stopping():
                 self.advance()
                 bar.update()
                 if self.recipe.is_validated(self.step):
                     self.record()
                     bar.set_postfix({name: f"{value:.4g}" for name, value in self.curve[-1].items() if name != "step"})
-                elif time.monotonic() - saved < self.recipe.checkpoint_seconds:
+                elif not stopping() and time.monotonic() - saved < self.recipe.checkpoint_seconds:
                     continue
                 self.save()
                 saved = time.monotonic()
@@ -146,7 +159,7 @@ class _Descent:
         norm = nn.utils.clip_grad_norm_(self.network.parameters(), self.recipe.clip)
         value = float(loss.detach())
         if not math.isfinite(value) or not math.isfinite(float(norm)):
-            kept = f"the checkpoint {str(self.file)!r} is kept" if self.file.exists() else "there is no checkpoint yet"
+            kept = f"the checkpoint {str(self.file)!r} is kept" if exists(self.file) else "there is no checkpoint yet"
             raise TrainingError(
                 f"step {self.step + 1} has loss {value:g} and gradient norm {float(norm):g}: {kept}; try a lower lr "
                 f"than {self.recipe.lr:g}"
@@ -172,6 +185,8 @@ class _Descent:
         )
 
     def restore(self) -> None:
-        progress = load_checkpoint(self.file, self.network, self.optimiser, self.generator, settings=self.settings)
+        progress: Progress = load_checkpoint(
+            self.file, self.network, self.optimiser, self.generator, settings=self.settings, schema=Progress
+        )
         self.step, self.total = progress["step"], progress["total"]
         self.counted, self.curve = progress["counted"], progress["curve"]

@@ -11,14 +11,17 @@ import time
 from collections.abc import Mapping
 from dataclasses import asdict, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, TypedDict
 
 import torch
 
-from torchdyn_plan.checks import check_choice, check_number
-from torchdyn_plan.errors import InputError
-from torchdyn_plan.files import write_whole
+from torchdyn_plan.checks import MOST_THREADS, check_choice, check_count, check_number, check_threads
+from torchdyn_plan.errors import InputError, TrainingError
+from torchdyn_plan.files import exists, short_path, write_whole
 from torchdyn_plan.nets.policy import Actor
+from torchdyn_plan.progress import progress_bar
+from torchdyn_plan.schemas import Count
+from torchdyn_plan.stopping import stop_when_safe
 from torchdyn_plan.tasks.task import Task
 from torchdyn_plan.threads import one_thread
 from torchdyn_plan.training.algorithms import learner_type, recipe_for
@@ -64,6 +67,8 @@ def train_policy(
     check_choice(f"policy of {task.name}", name, task.policies)
     training = task.policies[name]
     options = training.options() if options is None else options
+    check_threads("num_threads", num_threads)
+    check_count("workers", workers, minimum=0, maximum=MOST_THREADS)
     if not isinstance(options, training.options):
         raise InputError(f"options of {name} must be {training.options.__name__}, got {type(options).__name__}")
     recipe: DDPGRecipe = training.recipe()
@@ -127,6 +132,23 @@ def fit_policy(
         return training.run(resume, checkpoint_seconds)
 
 
+class Learner(TypedDict):
+    """Where `DDPG` stands."""
+
+    iteration: Count
+    cursor: Count
+    episode: Count
+
+
+class Progress(TypedDict):
+    """Where a training stands, beside its tensors."""
+
+    curve: list[dict[str, float]]
+    best: dict[str, float]
+    seconds: float
+    ddpg: Learner
+
+
 class _Training:
     def __init__(
         self, task: GoalTask, folder: Path, recipe: DDPGRecipe, *, score_every: int, workers: int, device: str
@@ -142,11 +164,9 @@ class _Training:
         self.seconds = 0.0
 
     def run(self, resume: bool, checkpoint_seconds: float) -> Path:
-        from tqdm import tqdm
-
         tensors, progress = {}, {}
-        if resume and self.file.exists():
-            tensors, progress = read_checkpoint(self.file, settings=self.settings)
+        if resume and exists(self.file):
+            tensors, progress = read_checkpoint(self.file, settings=self.settings, schema=Progress)
         self.ddpg = self.learner()
         self.best_actor = Actor(self.task.policy_config)
         if progress:
@@ -154,15 +174,16 @@ class _Training:
         log = _TensorBoard(self.folder, self.ddpg.iteration)
         saved = started = time.monotonic()
         rounds = self.recipe.iterations
-        with tqdm(total=rounds, initial=self.ddpg.iteration, desc="fit policy", unit="round") as bar:
-            while self.ddpg.iteration < rounds:
+        about: Any = {"total": rounds, "initial": self.ddpg.iteration, "desc": "fit policy", "unit": "round"}
+        with stop_when_safe() as stopping, progress_bar(**about) as bar:
+            while self.ddpg.iteration < rounds and not stopping():
                 figures = self.ddpg.iterate()
                 bar.update()
                 scored = self.ddpg.iteration % self.score_every == 0 or self.ddpg.iteration == rounds
                 if scored:
                     self.seconds, started = self.seconds + time.monotonic() - started, time.monotonic()
                     bar.set_postfix({name: f"{value:.3g}" for name, value in self.score(figures, log).items()})
-                if scored or time.monotonic() - saved > checkpoint_seconds:
+                if scored or stopping() or time.monotonic() - saved > checkpoint_seconds:
                     self.seconds, started = self.seconds + time.monotonic() - started, time.monotonic()
                     self.save()
                     saved = time.monotonic()
@@ -202,8 +223,11 @@ class _Training:
         write_checkpoint(self.file, tensors, settings=self.settings, progress=progress)
 
     def restore(self, tensors: dict[str, torch.Tensor], progress: dict[str, Any]) -> None:
-        self.ddpg.restore(tensors, progress["ddpg"])
-        self.best_actor.load_state_dict(group(tensors, "best"))
+        try:
+            self.ddpg.restore(tensors, progress["ddpg"])
+            self.best_actor.load_state_dict(group(tensors, "best"))
+        except (KeyError, ValueError, TypeError, RuntimeError, IndexError, StopIteration) as error:
+            raise TrainingError(f"checkpoint {short_path(self.file)} does not fit: {error!r}") from error
         self.curve, self.best, self.seconds = progress["curve"], progress["best"], progress["seconds"]
 
     def write_card(self) -> None:
@@ -235,14 +259,18 @@ class _TensorBoard:
     def __init__(self, folder: Path, step: int) -> None:
         try:
             from torch.utils.tensorboard import SummaryWriter
-        except ImportError:
-            self.writer = None
-        else:
+
             self.writer = SummaryWriter(str(folder), purge_step=step)
+        except (ImportError, OSError):
+            # A log is no reason to fail, on a full disk neither.
+            self.writer = None
 
     def add(self, figures: dict[str, float], step: int) -> None:
         """Log ``figures`` at ``step``."""
         if self.writer is not None:
-            for name, value in figures.items():
-                self.writer.add_scalar(name, value, step)
-            self.writer.flush()
+            try:
+                for name, value in figures.items():
+                    self.writer.add_scalar(name, value, step)
+                self.writer.flush()
+            except OSError:
+                self.writer = None

@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import Any
 
 from torchdyn_plan.errors import InputError
+from torchdyn_plan.files import is_file
 from torchdyn_plan.tasks.task import Task, load_task
 
 
@@ -36,6 +37,7 @@ def train(
     num_envs: int | None = None,
     num_threads: int = 0,
     workers: int = 0,
+    static: str | None = None,
     options: Any = None,
     algorithm: str | None = None,
 ) -> Path:
@@ -56,6 +58,7 @@ def train(
         num_envs: of a policy: episodes that run side by side; the recipe's own for None.
         num_threads: of a policy: threads of the simulation, 0 for all cores; does not change the result.
         workers: of a policy: Ray workers that run the episodes, 0 for none.
+        static: of ``eta``: the static planner whose arrivals the data must be; whichever it is for None.
         options: of a policy: an instance of its `PolicyTraining.options`; the defaults for None.
         algorithm: of a policy: ``ddpg``, ``averaged``; that of the task's recipe for None.
 
@@ -87,9 +90,9 @@ def train(
     if network == "forecaster":
         return fit.fit_forecaster(task, data, out, recipe, resume=resume)
     if network == "eta":
-        return fit.fit_eta(task, data, out, recipe, resume=resume)
+        return fit.fit_eta(task, data, out, recipe, static=static, resume=resume)
     beside = out / "forecaster" / "forecaster.safetensors"
-    forecaster = beside if beside.exists() else task.name
+    forecaster = beside if is_file(beside) else task.name
     return fit_spread.fit_spread(task, data, out, recipe, forecaster=forecaster, resume=resume)
 
 

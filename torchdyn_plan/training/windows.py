@@ -5,13 +5,13 @@ from pathlib import Path
 from typing import NamedTuple
 
 import torch
-from safetensors import SafetensorError
-from safetensors.torch import load_file
 from torch import Tensor
 
-from torchdyn_plan.checks import check_number
+from torchdyn_plan.checks import check_finite, check_number, check_trailing_shape
 from torchdyn_plan.errors import InputError
+from torchdyn_plan.files import short_path
 from torchdyn_plan.training.lines import Lines
+from torchdyn_plan.training.shards import read_shards
 
 
 class Paths(NamedTuple):
@@ -75,27 +75,24 @@ def load_paths(folder: Path) -> Paths:
     parts: list[Paths] = []
     offset = 0
     for shard in read_shards(folder, "paths", ("positions", "start", "length", "pocketed")):
+        _check_paths(folder, shard)
         parts.append(Paths(shard["positions"], shard["start"] + offset, shard["length"], shard["pocketed"]))
         offset += len(shard["positions"])
     return Paths(*(torch.cat(tensors) for tensors in zip(*parts, strict=True)))
 
 
-def read_shards(folder: Path, stem: str, names: tuple[str, ...]) -> list[dict[str, Tensor]]:
-    """Tensors of every ``stem-*.safetensors`` in ``folder``; raises `InputError` naming what is missing or broken."""
-    files = sorted(Path(folder).glob(f"{stem}-*.safetensors"))
-    if not files:
-        raise InputError(f"no {stem}-*.safetensors in {str(folder)!r}")
-    shards = []
-    for file in files:
-        try:
-            shard = load_file(file)
-        except (SafetensorError, OSError) as error:
-            raise InputError(f"{str(file)!r} is not a whole safetensors file: {error}") from error
-        missing = [name for name in names if name not in shard]
-        if missing:
-            raise InputError(f"{str(file)!r} lacks {', '.join(missing)}")
-        shards.append(shard)
-    return shards
+def _check_paths(folder: Path, shard: dict[str, Tensor]) -> None:
+    """Raise `InputError` unless the paths of a shard lie end to end, and are numbers."""
+    where = f"of the paths in {short_path(Path(folder))}"
+    check_trailing_shape(f"positions {where}", shard["positions"], 3)
+    check_finite(f"positions {where}", shard["positions"])
+    start, length, lost = (shard[name] for name in ("start", "length", "pocketed"))
+    if not (start.shape == length.shape == lost.shape == (len(length),)):
+        shapes = [tuple(shard[name].shape) for name in ("start", "length", "pocketed")]
+        raise InputError(f"start, length and pocketed {where} must have shape (E,), got {shapes}")
+    whole = start.dtype == length.dtype == torch.int64 and lost.dtype == torch.bool and bool((length >= 1).all())
+    if not whole or not torch.equal(start, length.cumsum(0) - length) or int(length.sum()) != len(shard["positions"]):
+        raise InputError(f"start and length {where} do not lay the paths end to end")
 
 
 def last_useful_step(paths: Paths, config: WindowConfig) -> Tensor:

@@ -23,7 +23,7 @@ from torchdyn_plan.tasks.trapper.data import (
     trapper_fitting,
 )
 from torchdyn_plan.tasks.trapper.task import TASK, ik_planner
-from torchdyn_plan.training import collect as collect_module
+from torchdyn_plan.training import shards
 from torchdyn_plan.training.arrival_data import Arrivals
 from torchdyn_plan.training.collect import collect
 from torchdyn_plan.training.runs import STATES_PER_RUN
@@ -37,7 +37,7 @@ STEPS = 200
 @pytest.fixture
 def short(monkeypatch):
     monkeypatch.setattr(module, "PATH_STEPS", STEPS)
-    monkeypatch.setattr(collect_module, "SHARD", {"paths": 6, "arrivals": 24})
+    monkeypatch.setattr(shards, "SHARD", {"paths": 6, "arrivals": 24})
 
 
 def gather(out, **settings):

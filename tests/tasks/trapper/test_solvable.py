@@ -1,4 +1,5 @@
 import dataclasses
+from pathlib import Path
 
 import pytest
 import torch
@@ -117,7 +118,7 @@ def test_a_map_is_measured_once_for_each_scene_and_planner(folders):
     assert folders[2] == [SCENE.digest(), other.digest(), SCENE.digest()]
 
 
-@pytest.mark.parametrize("damage", ["cut", "empty", "foreign", "flat", "oblong", "fractions"])
+@pytest.mark.parametrize("damage", ["cut", "empty", "foreign", "flat", "oblong", "fractions", "beyond", "negative"])
 def test_a_damaged_map_is_measured_again_and_replaced(folders, damage):
     lookup()
     (file,) = folders[1].iterdir()
@@ -126,6 +127,8 @@ def test_a_damaged_map_is_measured_again_and_replaced(folders, damage):
         "flat": {"steps": torch.zeros(9).int()},
         "oblong": {"steps": torch.zeros(3, 4).int()},
         "fractions": {"steps": torch.zeros(3, 3)},
+        "beyond": {"steps": torch.full((3, 3), 501).int()},
+        "negative": {"steps": torch.full((3, 3), -1).int()},
     }
     if damage in content:
         save_file(content[damage], file)
@@ -133,6 +136,14 @@ def test_a_damaged_map_is_measured_again_and_replaced(folders, damage):
         file.write_bytes(file.read_bytes()[:-5] if damage == "cut" else b"")
     assert lookup() == 2
     assert (load_file(file)["steps"] == 2).all()
+
+
+def test_a_map_that_cannot_be_cached_is_used_all_the_same(folders, monkeypatch):
+    folders[1].parent.write_text("in the way of the folder")
+    assert [lookup(), lookup()] == [1, 2]
+    monkeypatch.delenv("XDG_CACHE_HOME")
+    monkeypatch.setattr(Path, "home", lambda: Path("/proc/nowhere"))
+    assert lookup() == 3
 
 
 def test_a_shipped_map_comes_first(folders):

@@ -2,14 +2,14 @@
 
 from __future__ import annotations
 
+import contextlib
 import os
+import tempfile
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import torch
-from safetensors import SafetensorError
-from safetensors.torch import load_file, save_file
 from tensordict import TensorDictBase
 from torch import Tensor
 
@@ -18,7 +18,9 @@ from torchdyn_plan.envs.trapper.contact import is_pocketed
 from torchdyn_plan.envs.trapper.scene import TrapperScene
 from torchdyn_plan.envs.trapper.simulation import TrapperSimulation
 from torchdyn_plan.envs.trapper.starts import draw_starts
-from torchdyn_plan.files import write_whole
+from torchdyn_plan.errors import OutputError, WeightsError
+from torchdyn_plan.files import read_tensors, write_tensors
+from torchdyn_plan.progress import progress_bar
 from torchdyn_plan.tasks.task import Truth
 from torchdyn_plan.tasks.trapper.task import TASK
 
@@ -108,15 +110,13 @@ def measure_arrivals(
     planner: Callable[[TensorDictBase], TensorDictBase], scene: TrapperScene, *, num_threads: int = 0
 ) -> ArrivalMap:
     """Run ``planner`` from home to every point of a grid over the table, and look when it is there."""
-    from tqdm import tqdm
-
     count = int(-(-scene.table_side // SPACING)) + 1
     line = torch.linspace(-scene.half_side, scene.half_side, count)
     grid = torch.cartesian_prod(line, line)
     goals = torch.cat([grid, torch.full((len(grid), 1), scene.ball_radius)], dim=-1)
     arms = TrapperArmRunner(planner, len(goals), scene=scene, num_threads=num_threads)
     arrived = torch.full((len(goals),), NEVER)
-    for step in tqdm(range(LONGEST + 1), desc="measure arrivals", unit="step", leave=False):
+    for step in progress_bar(range(LONGEST + 1), desc="measure arrivals", unit="step", leave=False):
         arrived = torch.where((arrived == NEVER) & arms.is_reached(goals), step, arrived)
         arms.step(goals)
     return ArrivalMap(arrived.view(count, count), scene.half_side)
@@ -132,7 +132,9 @@ def arrival_map(
         if steps is not None:
             return ArrivalMap(steps.long(), scene.half_side)
     arrivals = measure_arrivals(planner, scene, num_threads=num_threads)
-    save_arrivals(arrivals, _cache() / name)
+    # A map that cannot be kept is as good as any other.
+    with contextlib.suppress(OutputError):
+        save_arrivals(arrivals, _cache() / name)
     return arrivals
 
 
@@ -143,19 +145,26 @@ def arrivals_name(static: str, scene: TrapperScene) -> str:
 
 def save_arrivals(arrivals: ArrivalMap, path: Path) -> None:
     """Write the map to ``path``, whole or not at all."""
-    write_whole(path, lambda temporary: save_file({"steps": arrivals.steps.int()}, temporary))
+    write_tensors(path, {"steps": arrivals.steps.int()})
 
 
 def _load(path: Path) -> Tensor | None:
     """Steps in the file; None if there is none, or a damaged one, which is measured again."""
     try:
-        content: dict[str, Any] = load_file(path)
-        steps: Tensor = content["steps"]
-    except (OSError, SafetensorError, KeyError):
+        _, content = read_tensors(path, WeightsError)
+    except WeightsError:
         return None
-    whole = steps.ndim == 2 and steps.shape[0] == steps.shape[1] and not steps.is_floating_point()
-    return steps if whole else None
+    steps = content.get("steps")
+    if steps is None or steps.dtype != torch.int32 or steps.ndim != 2 or steps.shape[0] != steps.shape[1]:
+        return None
+    # An arrival is a number of control steps, or never.
+    known = ((steps >= 0) & (steps <= LONGEST)) | (steps == NEVER)
+    return steps if len(steps) and bool(known.all()) else None
 
 
 def _cache() -> Path:
-    return Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "torchdyn_plan"
+    try:
+        return Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "torchdyn_plan"
+    except RuntimeError:
+        # Nobody's home.
+        return Path(tempfile.gettempdir()) / "torchdyn_plan"

@@ -27,7 +27,9 @@ class TrapperSettings(Settings):
     velocity: float = setting(
         3.0, text="Velocity of the ball at the start", unit="m/s", minimum=0.0, maximum=20.0, sweep=(0, 1, 2, 3, 4, 5)
     )
-    friction: float = setting(0.0, text="Friction loss of the ball", unit="N", minimum=0.0, sweep=(0, 2.5, 5, 7.5, 9.5))
+    friction: float = setting(
+        0.0, text="Friction loss of the ball", unit="N", minimum=0.0, maximum=1000.0, sweep=(0, 2.5, 5, 7.5, 9.5)
+    )
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -1,0 +1,167 @@
+"""Collected data in a folder: shards, and the descriptions that they are held against."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any, TypedDict
+
+from torch import Tensor
+
+from torchdyn_plan.errors import InputError
+from torchdyn_plan.files import read_json, read_metadata, read_tensors, short_path
+from torchdyn_plan.schemas import Count, Positive, check_content
+
+SHARD = {"paths": 1024, "arrivals": 2048}
+"""Episodes in a shard of each kind of data; of arrivals, sequences of runs."""
+
+
+class Arguments(TypedDict):
+    """What is read back of what a collection was asked for."""
+
+    episodes: Positive
+    seed: Count
+    num_envs: Positive
+    static: str
+    """Whose arrivals they are; of paths it says nothing."""
+
+
+class Description(TypedDict):
+    """What is read back of the description of a collection."""
+
+    arguments: Arguments
+    scene: str
+
+
+def shard_path(folder: Path, stem: str, seed: int, index: int) -> Path:
+    """File of the shard ``index`` of series ``seed`` of the data called ``stem``."""
+    return folder / f"{stem}-{seed}-{index:03d}.safetensors"
+
+
+def shard_sizes(stem: str, episodes: int) -> list[int]:
+    """Episodes of each shard of so many ``episodes``."""
+    size = SHARD[stem]
+    return [min(size, episodes - first) for first in range(0, episodes, size)]
+
+
+def surplus_shards(folder: Path, stem: str, seed: int, count: int) -> list[Path]:
+    """Shards of series ``seed`` in ``folder`` that are none of its first ``count``."""
+    known = {shard_path(folder, stem, seed, index) for index in range(count)}
+    return sorted(set(folder.glob(f"{stem}-{seed}-*.safetensors")) - known)
+
+
+def read_description(data: Path, stem: str, *, scene: str) -> dict[str, Any]:
+    """What ``data`` says of its ``stem-*.safetensors``.
+
+    These are ``data``, the arguments of each collection, ``scene``, and of arrivals ``static`` and, if it is a policy
+    of weights that were given, their digest as ``weights``.
+
+    Args:
+        data: folder of `torchdyn_plan.training.collect`.
+        stem: ``paths`` or ``arrivals``.
+        scene: digest of the scene that the data must come from.
+
+    Raises:
+        InputError: there is no description, it is broken, tells of another scene or of another static planner than
+            the next, or the shards are not those that it tells of.
+    """
+    data = Path(data)
+    files = sorted(data.glob(f"{stem}-*.json"))
+    if not files:
+        raise InputError(f"no {stem}-*.json in {short_path(data)}: its collection did not finish")
+    arguments: list[dict[str, Any]] = []
+    described: dict[Path, dict[str, str]] = {}
+    for file in files:
+        content = read_json(file)
+        about: Description = check_content(content, Description, f"{short_path(file)} is no description of data")
+        if about["scene"] != scene:
+            raise InputError(
+                f"{short_path(file)} tells of scene {about['scene']}, but the scene is {scene}: collect the data again"
+            )
+        described |= _check_shards(data, stem, about)
+        arguments.append(content["arguments"])
+    stray = sorted(set(data.glob(f"{stem}-*.safetensors")) - described.keys())
+    if stray:
+        raise InputError(
+            f"{short_path(stray[0])} belongs to no description in its folder: its collection did not finish, or was "
+            "of more episodes: collect again, or delete it"
+        )
+    _check_alike(described)
+    return {"data": arguments, "scene": scene} | _driver(next(iter(described.values())))
+
+
+def read_shards(folder: Path, stem: str, names: Sequence[str]) -> list[dict[str, Tensor]]:
+    """Tensors of every ``stem-*.safetensors`` in ``folder``; raises `InputError` naming what is missing or broken."""
+    files = sorted(Path(folder).glob(f"{stem}-*.safetensors"))
+    if not files:
+        raise InputError(f"no {stem}-*.safetensors in {short_path(Path(folder))}")
+    shards = []
+    for file in files:
+        made, shard = read_tensors(file, InputError)
+        missing = [name for name in names if name not in shard]
+        if missing:
+            raise InputError(f"{short_path(file)} lacks {', '.join(missing)}")
+        if "length" in names and made.get("episodes", str(len(shard["length"]))) != str(len(shard["length"])):
+            raise InputError(f"{short_path(file)} says {made['episodes']} episodes and has {len(shard['length'])}")
+        shards.append(shard)
+    return shards
+
+
+def check_made(path: Path, made: dict[str, str]) -> list[str]:
+    """What differs between how the shard at ``path`` was made, by its own word, and ``made``; it must tell all of it.
+
+    Raises:
+        InputError: the shard is damaged, or was made otherwise in anything but the number of its ``episodes``.
+    """
+    there = read_metadata(path, InputError)
+    told = {**made, **dict.fromkeys(_DECISIVE & there.keys())}
+    differing = [name for name in told if there.get(name) != made.get(name)]
+    for name in differing:
+        if name != "episodes":
+            raise InputError(
+                f"{short_path(path)} is of another collection: {name} is {there.get(name)} there, {made.get(name)} here"
+            )
+    return differing
+
+
+_DECISIVE = {"scene", "num_envs", "episodes", "static", "weights"}
+"""What decides a shard's numbers, beside its name."""
+
+
+def _check_shards(data: Path, stem: str, about: Description) -> dict[Path, dict[str, str]]:
+    """Shards that a description tells of, and what they tell; raises `InputError` where one is missing or another."""
+    asked = about["arguments"]
+    found: dict[Path, dict[str, str]] = {}
+    for index, episodes in enumerate(shard_sizes(stem, asked["episodes"])):
+        path = shard_path(data, stem, asked["seed"], index)
+        made = {"scene": about["scene"], "num_envs": str(asked["num_envs"]), "episodes": str(episodes)}
+        made |= {"static": asked["static"]} if stem == "arrivals" else {}
+        there = read_metadata(path, InputError)
+        for name, value in made.items():
+            if there.get(name) != value:
+                raise InputError(
+                    f"{short_path(path)} is not what its description says: {name} is {there.get(name)} there, {value} "
+                    "in the description: collect again"
+                )
+        found[path] = there
+    return found
+
+
+def _check_alike(described: dict[Path, dict[str, str]]) -> None:
+    """Raise `InputError` if shards are of the arrivals of several static planners."""
+    first = next(iter(described.values()))
+    for path, there in described.items():
+        if _driver(there) != _driver(first):
+            raise InputError(
+                f"{short_path(path)} has arrivals of {_named(there)}, others in its folder of {_named(first)}: a "
+                "network is of one static planner, whose arrivals have a folder of their own"
+            )
+
+
+def _driver(made: dict[str, str]) -> dict[str, str]:
+    """Which static planner was driven, by a shard's own word; nothing for paths."""
+    return {name: made[name] for name in ("static", "weights") if name in made}
+
+
+def _named(made: dict[str, str]) -> str:
+    return " with weights ".join(_driver(made).values())
