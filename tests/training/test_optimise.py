@@ -223,8 +223,13 @@ def test_a_signal_saves_the_step_that_is_going_on(tmp_path, number, monkeypatch)
         return step(self, *args, **kwargs)
 
     monkeypatch.setattr(torch.optim.AdamW, "step", told)
-    with pytest.raises(KeyboardInterrupt), terminable():
-        fit(tmp_path / "cut", checkpoint_seconds=3600.0)
+    # In the background of a shell Ctrl-C is ignored.
+    former = signal.signal(signal.SIGINT, signal.default_int_handler)
+    try:
+        with pytest.raises(KeyboardInterrupt), terminable():
+            fit(tmp_path / "cut", checkpoint_seconds=3600.0)
+    finally:
+        signal.signal(signal.SIGINT, former)
     rest, rest_curve, calls = fit(tmp_path / "cut", checkpoint_seconds=3600.0)
     assert calls == 40 - 17
     assert torch.equal(rest.weight, whole.weight)
