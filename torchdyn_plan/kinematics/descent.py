@@ -15,6 +15,10 @@ BLOCK = 64
 """Rows of one product of matrices: a fixed number, so that a row's answer does not depend on its company."""
 
 
+STUCK = 0.1
+"""A try ends where no joint moves by more than this share of the error [rad; m]: the way on is barred by limits."""
+
+
 class Search(NamedTuple):
     """What is asked of the descents; ``M`` is the number of targets."""
 
@@ -32,8 +36,10 @@ class Search(NamedTuple):
     iterations: int
     max_step: Tensor
     """``(N,)`` [rad; m]"""
-    posture: Tensor | None
+    posture: Tensor | None = None
     """``(M, N)``"""
+    weights: Tensor | None = None
+    """``(M, R, R)``, by which the error and the Jacobian's rows are multiplied."""
 
     def bounds(self, rows: Tensor) -> tuple[Tensor, Tensor]:
         """Limits of some rows, ``(A, N)``, or ``(N,)`` where all have the same."""
@@ -62,10 +68,9 @@ def descend(search: Search, tries: Tensor, rows: Tensor, *, all_tries: bool = Fa
     here, owner = torch.arange(len(q), device=rows.device), rows.repeat_interleave(number)
     for iteration in range(search.iterations + 1):
         index = owner[here]
-        wanted = search.target[index]
         pose, jacobian = evaluate(search.arm, q)
-        error = constraint_error(pose, wanted, constraint=search.constraint, symmetry=search.symmetry)
-        left = _lengths(error)
+        error = error_at(search, pose, index)
+        left = lengths(error)
         now = search.cost(left)
         nearer = now < cost[here]
         better = here[nearer]
@@ -77,20 +82,38 @@ def descend(search: Search, tries: Tensor, rows: Tensor, *, all_tries: bool = Fa
         if iteration == search.iterations or not bool(going.any()):
             break
         if not bool(going.all()):
-            here, q, index, wanted = here[going], q[going], index[going], wanted[going]
-            jacobian, error = jacobian[going], error[going]
-        q = _stepped(search, q, constraint_jacobian(jacobian, wanted, constraint=search.constraint), error, index)
+            here, q, index, jacobian, error = here[going], q[going], index[going], jacobian[going], error[going]
+        after = stepped(search, q, rows_at(search, jacobian, index), error, index)
+        moving = (after - q).abs().amax(dim=-1) > STUCK * error.norm(dim=-1)
+        if not bool(moving.all()):
+            here, after = here[moving], after[moving]
+            if not len(here):
+                break
+        q = after
     return best.view(count, number, joints), residual.view(count, number, 2)
+
+
+def error_at(search: Search, pose: Tensor, rows: Tensor) -> Tensor:
+    """What is left to go from ``pose`` (A, 4, 4) to the targets of ``rows`` (A,): ``(A, R)`` [m; rad]."""
+    target = search.target[rows]
+    error = constraint_error(pose, target, constraint=search.constraint, symmetry=search.symmetry)
+    return error if search.weights is None else (search.weights[rows] @ error.unsqueeze(-1)).squeeze(-1)
+
+
+def rows_at(search: Search, jacobian: Tensor, rows: Tensor) -> Tensor:
+    """The Jacobian's rows ``(A, R, N)`` that move along `error_at`, from the whole ones ``(A, 6, N)``."""
+    # Only the rows of an axis depend on the target.
+    target = search.target[rows] if search.constraint == "axis" else search.target
+    found = constraint_jacobian(jacobian, target, constraint=search.constraint)
+    return found if search.weights is None else search.weights[rows] @ found
 
 
 def residual_at(search: Search, q: Tensor, rows: Tensor) -> Tensor:
     """Distances ``(A, 2)`` of ``q`` (A, N) from the targets of ``rows`` (A,)."""
-    pose, _ = evaluate(search.arm, q)
-    target = search.target[rows]
-    return _lengths(constraint_error(pose, target, constraint=search.constraint, symmetry=search.symmetry))
+    return lengths(error_at(search, evaluate(search.arm, q)[0], rows))
 
 
-def _lengths(error: Tensor) -> Tensor:
+def lengths(error: Tensor) -> Tensor:
     """Of place and of direction, ``(A, R)`` -> ``(A, 2)``."""
     return torch.stack([error[:, :3].norm(dim=-1), error[:, 3:].norm(dim=-1)], dim=-1)
 
@@ -103,7 +126,7 @@ def evaluate(arm: Arm, q: Tensor) -> tuple[Tensor, Tensor]:
     return pose, jacobian
 
 
-def _stepped(search: Search, q: Tensor, jacobian: Tensor, error: Tensor, index: Tensor) -> Tensor:
+def stepped(search: Search, q: Tensor, jacobian: Tensor, error: Tensor, index: Tensor) -> Tensor:
     """One step of Levenberg and Marquardt (Sugihara 2011: λ² grows with the error), within limits of step and joint."""
     lower, upper = search.bounds(index)
     damping = (0.1 * (error * error).sum(dim=-1) + _least_damping(q.dtype)).sqrt()

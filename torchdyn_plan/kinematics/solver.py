@@ -15,13 +15,13 @@ from torchdyn_plan.checks import check_choice, check_number
 from torchdyn_plan.errors import InputError
 from torchdyn_plan.kinematics.arm import Arm
 from torchdyn_plan.kinematics.branches import NUMBER, Universal, all_branches, tool_turns, universal
-from torchdyn_plan.kinematics.descent import Search, descend, evaluate, residual_at
+from torchdyn_plan.kinematics.descent import Search, descend, evaluate, residual_at, rows_at
 from torchdyn_plan.kinematics.implicit import refine
 from torchdyn_plan.kinematics.nearest import TURN, first_distinct, reduced, revolute, speeds, travel, turned_towards
-from torchdyn_plan.kinematics.targets import CONSTRAINTS, as_pose, as_rows, constraint_jacobian, is_pose
+from torchdyn_plan.kinematics.targets import CONSTRAINTS, as_pose, as_rows, is_pose
 from torchdyn_plan.precision import without_autocast
 
-ROUNDS = (1, 4, 16, 64)
+ROUNDS = (1, 4, 16, 64, 128)
 """Starts that a row still unsolved is given, side by side, in each round."""
 OVERSHOOT = 0.1
 """[rad; m]; a start that is further outside its limits is turned by 2π where that brings it inside."""
@@ -134,7 +134,7 @@ def solve_ik(
         lower, upper = _limits(arm, None if q0 is None else first, max_move)
         tolerances = position_tolerance, rotation_tolerance
         search = Search(arm, wanted, lower, upper, constraint, symmetry, tolerances, iterations, step, posture)
-        q, status, residual = without_autocast(_solve_rows, search, start, first, rounds, solutions or 1)
+        q, status, residual = without_autocast(solve_rows, search, start, first, rounds, solutions or 1)
     extra = () if solutions is None else (solutions,)
     shape = *batch, *extra
     result = IKResult(q.reshape(*shape, count), status.reshape(shape), residual.reshape(*shape, 2))
@@ -202,7 +202,7 @@ def _middle(arm: Arm) -> Tensor:
     return low + (high - low) * _spread(1, arm.num_joints)[0].to(low)
 
 
-def _solve_rows(
+def solve_rows(
     search: Search, start: Tensor, first: Tensor, rounds: Sequence[int], count: int
 ) -> tuple[Tensor, Tensor, Tensor]:
     """The best ``K`` of each row (M, K, N), their status (M, K) and residuals (M, K, 2).
@@ -215,7 +215,8 @@ def _solve_rows(
     residual = torch.full((len(first), count, 2), torch.inf, dtype=first.dtype, device=first.device)
     empty = first.unsqueeze(1).repeat(1, count, 1)
     pool = _Pool(empty, residual, first, speeds(search.arm), revolute(search.arm))
-    form = universal(search.arm) if search.constraint == "pose" else ""
+    whole = search.constraint == "pose" and search.weights is None
+    form = universal(search.arm) if whole else "a part of the pose"
     known = not isinstance(form, str)
     # A row is done once its last place is filled; where all solutions are known, once it has one.
     needed = 0 if known else count - 1
@@ -316,7 +317,7 @@ def _status(search: Search, pool: _Pool, valid: Tensor) -> Tensor:
 def reason(search: Search, q: Tensor, rows: Tensor) -> Tensor:
     """Status ``(A,)`` of rows that were not solved and came to ``q`` (A, N)."""
     _, jacobian = evaluate(search.arm, q)
-    values = torch.linalg.svdvals(constraint_jacobian(jacobian, search.target[rows], constraint=search.constraint))
+    values = torch.linalg.svdvals(rows_at(search, jacobian, rows))
     lower, upper = search.bounds(rows)
     at_limit = ((q <= lower) | (q >= upper)).any(dim=-1)
     status = torch.where(at_limit, int(IKStatus.LIMITED), int(IKStatus.UNREACHED))

@@ -16,15 +16,15 @@ CONSTRAINTS = {"pose": 6, "axis": 5, "position": 3}
 """Directions that each constrains: the whole pose, place and direction of the tool's z axis, place."""
 
 
-def as_pose(target: Tensor, arm: Arm, constraint: str) -> Tensor:
+def as_pose(target: Tensor, arm: Arm, constraint: str, *, name: str = "target") -> Tensor:
     """``target`` as poses ``(*B, 4, 4)``, checked; ``(*B, 3)`` will do for a position."""
     if constraint == "position" and isinstance(target, Tensor) and target.shape[-1:] == (3,):
-        check_like("target", target, arm)
+        check_like(name, target, arm)
         place = target.unsqueeze(-1)
         eye = torch.eye(4, dtype=target.dtype, device=target.device).expand(*place.shape[:-2], 4, 4)
         return torch.cat([eye[..., :3], torch.cat([place, torch.ones_like(place[..., :1, :])], dim=-2)], dim=-1)
-    check_trailing_shape("target", target, 4, 4)
-    check_like("target", target, arm)
+    check_trailing_shape(name, target, 4, 4)
+    check_like(name, target, arm)
     return target
 
 
@@ -109,6 +109,15 @@ def rotation_vector(rotation: Tensor) -> Tensor:
     cosine = 0.5 * (rotation.diagonal(dim1=-2, dim2=-1).sum(dim=-1, keepdim=True) - 1.0)
     vector = sine * _angle_over_sine(sine, cosine)
     return torch.where(cosine < -0.998, _near_half_turn(rotation, sine, cosine), vector)
+
+
+def rotation_matrix(vector: Tensor) -> Tensor:
+    """The rotation ``(*B, 3, 3)`` whose axis times angle is ``vector`` (*B, 3) [rad]: `rotation_vector` undone."""
+    angle = vector.norm(dim=-1).clamp_min(torch.finfo(vector.dtype).tiny)[..., None, None]
+    eye = torch.eye(3, dtype=vector.dtype, device=vector.device)
+    cross = torch.linalg.cross(vector.unsqueeze(-2).expand(*vector.shape, 3), eye.expand(*vector.shape, 3)).mT
+    # sin(θ)/θ and (1 - cos(θ))/θ² = ½ (sin(½θ)/(½θ))².
+    return eye + torch.sinc(angle / math.pi) * cross + 0.5 * torch.sinc(angle / (2.0 * math.pi)) ** 2 * cross @ cross
 
 
 def _angle_over_sine(sine: Tensor, cosine: Tensor) -> Tensor:
