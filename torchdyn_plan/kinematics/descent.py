@@ -40,6 +40,8 @@ class Search(NamedTuple):
     """``(M, N)``"""
     weights: Tensor | None = None
     """``(M, R, R)``, by which the error and the Jacobian's rows are multiplied."""
+    ease: Tensor | None = None
+    """``(N,)``; of the motions that would do, a joint takes a share that grows with the square of this."""
 
     def bounds(self, rows: Tensor) -> tuple[Tensor, Tensor]:
         """Limits of some rows, ``(A, N)``, or ``(N,)`` where all have the same."""
@@ -131,7 +133,12 @@ def stepped(search: Search, q: Tensor, jacobian: Tensor, error: Tensor, index: T
     lower, upper = search.bounds(index)
     damping = (0.1 * (error * error).sum(dim=-1) + _least_damping(q.dtype)).sqrt()
     preferred = None if search.posture is None else 0.3 * (search.posture[index] - q)
+    if search.ease is not None:
+        jacobian = jacobian * search.ease
+        preferred = None if preferred is None else preferred / search.ease
     step = dls_step_within(jacobian, error, damping, q, lower, upper, preferred=preferred)
+    if search.ease is not None:
+        step = step * search.ease
     worst = (step.abs() / search.max_step).amax(dim=-1, keepdim=True)
     return torch.clamp(q + step / worst.clamp_min(1.0), lower, upper)
 
