@@ -90,13 +90,14 @@ def solve_ik(
     """Joint positions at which the tool is at ``target``, by damped least squares with restarts.
 
     A row is never disturbed by another: bad rows are told by their status, and a row alone has the same answer as in
-    a batch. The starts after the first are the same for every row; an arm of the UR family is given the solutions of
-    `branches` instead. Joints are turned by 2π towards the start as far as their limits allow, and of several solutions
-    that is taken to which the slowest joint is soonest at its speed limit (where an arm has none, the least turn).
+    a batch. The starts after the first are the same for every row. Whole poses of arms of the UR family are solved by
+    `branches` first, unless ``rounds`` is one alone. Joints are turned by 2π towards the start as far as their limits
+    allow, and of the solutions found that is taken which all joints reach soonest at their speed limits (where an arm
+    does not have them all, that with the least turn).
 
     With ``solutions=k`` a row has up to ``k`` of them that differ, the nearest first. Those that were not found have a
     status other than `SOLVED` and are copies of the first, with infinite residuals. All starts of a round then go to
-    their ends, and further rounds are made until there are ``k``; an arm of the UR family has at most 8 and needs none.
+    their ends, and further rounds are made until there are ``k``; an arm of the UR family has 8 at most, all known.
 
     Args:
         arm: whose tool it is.
@@ -217,11 +218,15 @@ def solve_rows(
     pool = _Pool(empty, residual, first, speeds(search.arm), revolute(search.arm))
     whole = search.constraint == "pose" and search.weights is None
     form = universal(search.arm) if whole else "a part of the pose"
-    known = not isinstance(form, str)
+    known = not isinstance(form, str) and (count > 1 or len(rounds) > 1)
     # A row is done once its last place is filled; where all solutions are known, once it has one.
     needed = 0 if known else count - 1
     open_rows = valid.nonzero().squeeze(-1)
-    for stage in _stages(rounds, known=known, several=count > 1):
+    if known and count == 1:
+        # Nothing is nearer than to stay.
+        pool.residual[open_rows, 0] = residual_at(search, first[open_rows], open_rows)
+        open_rows = open_rows[search.cost(pool.residual[open_rows, 0]) > 1.0]
+    for stage in _stages(rounds, known=known):
         if not len(open_rows):
             break
         if stage is None:
@@ -238,12 +243,10 @@ def solve_rows(
     return torch.where(valid[:, None, None], pool.q, start.unsqueeze(1)), status, pool.residual
 
 
-def _stages(rounds: Sequence[int], *, known: bool, several: bool) -> list[tuple[int, int] | None]:
+def _stages(rounds: Sequence[int], *, known: bool) -> list[tuple[int, int] | None]:
     """The first start and the number of starts of each round; None stands for the solutions of `branches`."""
     stages: list[tuple[int, int] | None] = list(zip(accumulate(rounds, initial=0), rounds, strict=False))
-    if known and (several or len(stages) > 1):
-        stages.insert(0 if several else 1, None)
-    return stages
+    return [None, *stages] if known else stages
 
 
 def _start_tries(search: Search, first: Tensor, rows: Tensor, begin: int, number: int) -> Tensor:
