@@ -1,7 +1,10 @@
 """Arms as batched torch: pose and Jacobian in closed form, damped least squares, and inverse kinematics by it."""
 
 from torchdyn_plan.kinematics.arm import Arm
+from torchdyn_plan.kinematics.branches import Branches, branches
+from torchdyn_plan.kinematics.cartesian import ArmSolver
 from torchdyn_plan.kinematics.dls import dls_step, limited_step, square_turn, upright_error
+from torchdyn_plan.kinematics.follow import follow
 from torchdyn_plan.kinematics.fused import compiled_pose_and_jacobian
 from torchdyn_plan.kinematics.joint import Joint
 from torchdyn_plan.kinematics.solver import IKResult, IKStatus, solve_ik
@@ -12,13 +15,17 @@ __all__ = [
     "UR5_LINKS",
     "UR5_SPEED_LIMIT",
     "Arm",
+    "ArmSolver",
+    "Branches",
     "IKResult",
     "IKStatus",
     "Joint",
+    "branches",
     "compiled_pose_and_jacobian",
     "constraint_error",
     "constraint_jacobian",
     "dls_step",
+    "follow",
     "limited_step",
     "rotation_vector",
     "solve_ik",

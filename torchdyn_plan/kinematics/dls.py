@@ -59,3 +59,51 @@ def limited_step(step: Tensor, limit: Tensor, gain: float) -> Tensor:
     """Shorten ``step`` (*B, N) to ``gain`` of itself, and further so that no joint moves more than ``limit`` (N,)."""
     worst = (step.abs() / limit).amax(dim=-1, keepdim=True)
     return step * torch.clamp(1.0 / worst.clamp_min(1e-12), max=gain)
+
+
+def dls_step_within(
+    jacobian: Tensor,
+    error: Tensor,
+    damping: Tensor,
+    q: Tensor,
+    lower: Tensor,
+    upper: Tensor,
+    *,
+    preferred: Tensor | None = None,
+) -> Tensor:
+    """`dls_step` for rows ``(M, …)``, by the joints that may move.
+
+    A joint at its limit that would be pushed out is left out, and the step solved anew for its row: so the others do
+    the whole of the work, not what such a joint leaves to them.
+
+    Args:
+        jacobian: ``(M, R, N)``
+        error: ``(M, R)``
+        damping: ``(M,)``
+        q: where the joints are, ``(M, N)``.
+        lower: limits, ``(N,)`` or ``(M, N)``.
+        upper: limits, ``(N,)`` or ``(M, N)``.
+        preferred: ``(M, N)``
+
+    Returns:
+        ``(M, N)``, 0 for joints that are left out.
+    """
+    step = dls_step(jacobian, error, damping, preferred=preferred)
+    may_fall, may_rise = q > lower, q < upper
+    held = _pushed_out(step, may_fall, may_rise)
+    rows = held.any(dim=-1).nonzero().squeeze(-1)
+    held = held[rows]
+    while len(rows):
+        free = (~held).to(step.dtype)
+        wish = None if preferred is None else preferred[rows] * free
+        again = dls_step(jacobian[rows] * free.unsqueeze(-2), error[rows], damping[rows], preferred=wish)
+        step[rows] = again
+        more = _pushed_out(again, may_fall[rows], may_rise[rows])
+        going = more.any(dim=-1)
+        rows, held = rows[going], (held | more)[going]
+    return step
+
+
+def _pushed_out(step: Tensor, may_fall: Tensor, may_rise: Tensor) -> Tensor:
+    """Which joints would leave their limits, ``(M, N)`` bool."""
+    return ((step < 0) & ~may_fall) | ((step > 0) & ~may_rise)

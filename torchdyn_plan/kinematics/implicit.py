@@ -47,4 +47,5 @@ def refine(
         error = constraint_error(pose, target, constraint=constraint, symmetry=symmetry)
         rows = constraint_jacobian(jacobian, target, constraint=constraint) * free.unsqueeze(-2)
         q = q + dls_step(rows, error, damping)
-    return torch.where(solved.unsqueeze(-1), q, constant)
+    # The last bit of the way may not lead outside: neither a status nor an arm would forgive it.
+    return torch.where(solved.unsqueeze(-1), torch.clamp(q, arm.lower, arm.upper), constant)

@@ -5,27 +5,30 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from enum import IntEnum
+from itertools import accumulate
 from typing import NamedTuple
 
 import torch
 from torch import Tensor
 
-from torchdyn_plan.checks import check_choice, check_number, check_same_device, check_trailing_shape
+from torchdyn_plan.checks import check_choice, check_number
 from torchdyn_plan.errors import InputError
 from torchdyn_plan.kinematics.arm import Arm
-from torchdyn_plan.kinematics.dls import dls_step
+from torchdyn_plan.kinematics.branches import NUMBER, Universal, all_branches, tool_turns, universal
+from torchdyn_plan.kinematics.descent import Search, descend, evaluate, residual_at, rows_at
 from torchdyn_plan.kinematics.implicit import refine
-from torchdyn_plan.kinematics.targets import CONSTRAINTS, constraint_error, constraint_jacobian
+from torchdyn_plan.kinematics.nearest import TURN, first_distinct, reduced, revolute, speeds, travel, turned_towards
+from torchdyn_plan.kinematics.targets import CONSTRAINTS, as_pose, as_rows, is_pose
 from torchdyn_plan.precision import without_autocast
 
-BLOCK = 64
-"""Rows of one product of matrices: a fixed number, so that a row's answer does not depend on its company."""
-ROUNDS = (1, 4, 16, 64)
+ROUNDS = (1, 4, 16, 64, 128)
 """Starts that a row still unsolved is given, side by side, in each round."""
+OVERSHOOT = 0.1
+"""[rad; m]; a start that is further outside its limits is turned by 2π where that brings it inside."""
 
 
 class IKStatus(IntEnum):
-    """How a row of `solve_ik` ended."""
+    """How a row of `solve_ik` ended, or a step of `follow`."""
 
     SOLVED = 0
     """Within the tolerances and the joints' limits."""
@@ -37,10 +40,12 @@ class IKStatus(IntEnum):
     """As `UNREACHED`, with a joint at its limit."""
     INVALID = 4
     """The target or the start is NaN or infinite, or the target's rotation is not one; nothing was solved."""
+    LATE = 5
+    """As `UNREACHED`, with a joint at its speed limit; of `follow` alone."""
 
 
 class IKResult(NamedTuple):
-    """What `solve_ik` found."""
+    """What `solve_ik` found; with ``solutions=k`` each has a dimension of ``k`` after the batch's."""
 
     q: Tensor
     """``(*B, N)`` [rad; m]; the nearest that was found where the row is not solved, the start where it is invalid."""
@@ -50,16 +55,19 @@ class IKResult(NamedTuple):
     """``(*B, 2)``, distance of place [m] and of direction [rad] from the target; infinite where the row is invalid."""
 
 
-class _Search(NamedTuple):
-    """What every row shares."""
+class _Pool(NamedTuple):
+    """The best that each row has found so far, ``K`` of them, the first the nearest to the start."""
 
-    arm: Arm
-    constraint: str
-    symmetry: int
-    tolerances: tuple[float, float]
-    iterations: int
-    max_step: Tensor
-    posture: Tensor | None
+    q: Tensor
+    """``(M, K, N)``"""
+    residual: Tensor
+    """``(M, K, 2)``, infinite in places that are still empty."""
+    start: Tensor
+    """``(M, N)``, to which they are near."""
+    speed: Tensor
+    """``(N,)``, see `nearest.speeds`."""
+    turns: Tensor
+    """``(N,)`` bool, joints that are the same after a whole turn."""
 
 
 def solve_ik(
@@ -74,18 +82,28 @@ def solve_ik(
     iterations: int = 16,
     rounds: Sequence[int] = ROUNDS,
     max_step: float | Tensor = 1.0,
+    max_move: float | Tensor | None = None,
     posture: Tensor | None = None,
+    solutions: int | None = None,
     differentiable: bool = False,
 ) -> IKResult:
     """Joint positions at which the tool is at ``target``, by damped least squares with restarts.
 
     A row is never disturbed by another: bad rows are told by their status, and a row alone has the same answer as in
-    a batch. The starts after the first are the same for every row.
+    a batch. The starts after the first are the same for every row. Whole poses of arms of the UR family are solved by
+    `branches` first, unless ``rounds`` is one alone. Joints are turned by 2π towards the start as far as their limits
+    allow, and of the solutions found that is taken which all joints reach soonest at their speed limits (where an arm
+    does not have them all, that with the least turn).
+
+    With ``solutions=k`` a row has up to ``k`` of them that differ, the nearest first. Those that were not found have a
+    status other than `SOLVED` and are copies of the first, with infinite residuals. All starts of a round then go to
+    their ends, and further rounds are made until there are ``k``; an arm of the UR family has 8 at most, all known.
 
     Args:
         arm: whose tool it is.
         target: ``(*B, 4, 4)``, base frame [m]; ``(*B, 3)`` will do for the constraint "position".
-        q0: start of the first round, ``(*B, N)`` or ``(N,)``; a fixed one by default.
+        q0: start of the first round, ``(*B, N)`` or ``(N,)``; a fixed one by default. Outside the limits it is brought
+            inside.
         constraint: "pose", "axis" (place, and direction of the tool's z axis: yaw is free) or "position".
         symmetry: for the constraint "pose", the tool is the same after one ``symmetry``-th of a turn about its z axis.
         position_tolerance: [m]
@@ -93,7 +111,9 @@ def solve_ik(
         iterations: most steps from one start.
         rounds: number of starts, side by side, in each round; rows solved in one do not enter the next.
         max_step: most that any joint moves in one step, a number or ``(N,)`` [rad; m].
+        max_move: most that any joint may be away from ``q0`` at the end, a number or ``(N,)`` [rad; m].
         posture: ``(*B, N)`` or ``(N,)``, to which the motion that the constraint leaves free is drawn.
+        solutions: how many are wanted of each row; ``q`` is then ``(*B, k, N)``, and the others likewise.
         differentiable: give ``q`` derivatives in ``target`` and the arm's own tensors, see `implicit.refine`.
 
     Raises:
@@ -102,165 +122,206 @@ def solve_ik(
     check_choice("constraint", constraint, CONSTRAINTS)
     check_number("symmetry", symmetry, minimum=1, integer=True)
     check_number("iterations", iterations, minimum=1, integer=True)
-    target = _as_pose(target, arm, constraint)
+    if solutions is not None:
+        check_number("solutions", solutions, minimum=1, integer=True)
+    target = as_pose(target, arm, constraint)
     batch, count = target.shape[:-2], arm.num_joints
     with torch.no_grad():
         wanted = target.detach().reshape(-1, 4, 4)
-        posture = None if posture is None else _rows("posture", posture, arm, batch)
-        limit = torch.as_tensor(max_step, dtype=wanted.dtype, device=wanted.device).expand(count)
+        posture = None if posture is None else as_rows("posture", posture, arm, batch)
+        step = joint_numbers("max_step", max_step, arm)
+        start = _middle(arm).expand(len(wanted), count) if q0 is None else as_rows("q0", q0, arm, batch)
+        first = inside_limits(arm, start)
+        lower, upper = _limits(arm, None if q0 is None else first, max_move)
         tolerances = position_tolerance, rotation_tolerance
-        search = _Search(arm, constraint, symmetry, tolerances, iterations, limit, posture)
-        starts = _starts(arm, sum(rounds))
-        first = starts[:1].expand(len(wanted), count) if q0 is None else _rows("q0", q0, arm, batch)
-        q, status, residual = without_autocast(_solve_rows, search, wanted, first, starts, rounds)
-    result = IKResult(q.view(*batch, count), status.view(batch), residual.view(*batch, 2))
+        search = Search(arm, wanted, lower, upper, constraint, symmetry, tolerances, iterations, step, posture)
+        q, status, residual = without_autocast(solve_rows, search, start, first, rounds, solutions or 1)
+    extra = () if solutions is None else (solutions,)
+    shape = *batch, *extra
+    result = IKResult(q.reshape(*shape, count), status.reshape(shape), residual.reshape(*shape, 2))
     if not differentiable:
         return result
-    return result._replace(
-        q=refine(arm, target, result.q, result.status == 0, constraint=constraint, symmetry=symmetry)
-    )
+    wanted = target if solutions is None else target.unsqueeze(-3).expand(*shape, 4, 4)
+    solved = result.status == IKStatus.SOLVED
+    return result._replace(q=refine(arm, wanted, result.q, solved, constraint=constraint, symmetry=symmetry))
 
 
-def _as_pose(target: Tensor, arm: Arm, constraint: str) -> Tensor:
-    """``target`` as poses, checked."""
-    if constraint == "position" and isinstance(target, Tensor) and target.shape[-1:] == (3,):
-        place = target.unsqueeze(-1)
-        eye = torch.eye(4, dtype=target.dtype, device=target.device).expand(*place.shape[:-2], 4, 4)
-        return torch.cat([eye[..., :3], torch.cat([place, torch.ones_like(place[..., :1, :])], dim=-2)], dim=-1)
-    check_trailing_shape("target", target, 4, 4)
-    _check_like("target", target, arm)
-    return target
+def joint_numbers(name: str, value: float | Tensor, arm: Arm) -> Tensor:
+    """A positive number, or one for each joint, as ``(N,)``."""
+    if not isinstance(value, Tensor):
+        check_number(name, value)
+    numbers = torch.as_tensor(value, dtype=arm.lower.dtype, device=arm.lower.device)
+    if numbers.shape not in ((), arm.lower.shape) or not bool((numbers > 0).all()):
+        raise InputError(f"{name} must be positive, a number or of shape {tuple(arm.lower.shape)}, got {value!r}")
+    return numbers.expand(arm.num_joints)
 
 
-def _check_like(name: str, value: Tensor, arm: Arm) -> None:
-    check_same_device(name, value, arm.lower.device, "the arm")
-    if value.dtype != arm.lower.dtype:
-        raise InputError(f"{name} is {value.dtype}, but the arm is {arm.lower.dtype}: convert one of them")
+def inside_limits(arm: Arm, q: Tensor) -> Tensor:
+    """``q`` (*B, N) within the limits: the same pose where whole turns bring it there, else the nearest position."""
+    q, turns = reduced(arm, q), revolute(arm)
+    outside = torch.maximum(arm.lower - q, q - arm.upper)
+    turned = turned_towards(q, torch.clamp(q, arm.lower, arm.upper), arm.lower, arm.upper)
+    q = torch.where(turns & (outside > OVERSHOOT), turned, q)
+    return torch.where(q.isnan(), q, torch.clamp(q, arm.lower, arm.upper))
 
 
-def _rows(name: str, value: Tensor, arm: Arm, batch: torch.Size) -> Tensor:
-    """Joint positions ``(*B, N)`` or ``(N,)`` as rows ``(M, N)``, checked."""
-    check_trailing_shape(name, value, arm.num_joints)
-    _check_like(name, value, arm)
-    if value.shape[:-1] not in (batch, torch.Size()):
-        check_trailing_shape(name, value, *batch, arm.num_joints)
-    return value.detach().expand(*batch, arm.num_joints).reshape(-1, arm.num_joints)
+def _limits(arm: Arm, start: Tensor | None, max_move: float | Tensor | None) -> tuple[Tensor, Tensor]:
+    """Limits of the search, ``(N,)``, or ``(M, N)`` where it is bound to ``start``."""
+    if max_move is None:
+        return arm.lower, arm.upper
+    if start is None:
+        raise InputError("max_move bounds the way from q0: give q0 with it")
+    move = joint_numbers("max_move", max_move, arm)
+    return torch.maximum(arm.lower, start - move), torch.minimum(arm.upper, start + move)
 
 
-def _starts(arm: Arm, count: int) -> Tensor:
-    """Joint positions spread over the limits, ``(count, N)``, always the same; more than a turn is the same again.
+def _spread(count: int, joints: int) -> Tensor:
+    """Points ``(count, N)`` float64 of the unit cube, always the same.
 
     Roberts' additive recurrence: frac(½ + k φ⁻ⁱ), with φ the root of φᴺ⁺¹ = φ + 1.
     """
     ratio = 2.0
     for _ in range(40):
-        ratio = (1.0 + ratio) ** (1.0 / (arm.num_joints + 1))
-    steps = ratio ** -torch.arange(1.0, arm.num_joints + 1.0, dtype=torch.float64)
-    unit = (0.5 + torch.arange(1.0, count + 1.0, dtype=torch.float64).unsqueeze(-1) * steps).frac()
-    lower, upper = arm.lower.clamp(min=-math.pi), arm.upper.clamp(max=math.pi)
-    return lower + (upper - lower) * unit.to(lower)
+        ratio = (1.0 + ratio) ** (1.0 / (joints + 1))
+    steps = ratio ** -torch.arange(1.0, joints + 1.0, dtype=torch.float64)
+    return (0.5 + torch.arange(1.0, count + 1.0, dtype=torch.float64).unsqueeze(-1) * steps).frac()
 
 
-def _solve_rows(
-    search: _Search, target: Tensor, first: Tensor, starts: Tensor, rounds: Sequence[int]
+def _range(arm: Arm, lower: Tensor, upper: Tensor) -> tuple[Tensor, Tensor]:
+    """Limits between which starts are spread, finite; more than a turn is the same again."""
+    has_lower, has_upper = lower.isfinite(), upper.isfinite()
+    low = torch.where(has_lower, lower, torch.where(has_upper, upper - 2.0 * math.pi, -math.pi))
+    high = torch.where(has_upper, upper, torch.where(has_lower, lower + 2.0 * math.pi, math.pi))
+    middle, half = 0.5 * (low + high), 0.5 * (high - low)
+    half = torch.where(revolute(arm), half.clamp(max=math.pi), half)
+    return middle - half, middle + half
+
+
+def _middle(arm: Arm) -> Tensor:
+    """The start of who gives none, ``(N,)``."""
+    low, high = _range(arm, arm.lower, arm.upper)
+    return low + (high - low) * _spread(1, arm.num_joints)[0].to(low)
+
+
+def solve_rows(
+    search: Search, start: Tensor, first: Tensor, rounds: Sequence[int], count: int
 ) -> tuple[Tensor, Tensor, Tensor]:
-    """Best positions (M, N), status (M,) and residuals (M, 2) for targets (M, 4, 4)."""
-    valid = _is_pose(target, search.constraint) & first.isfinite().all(dim=-1)
+    """The best ``K`` of each row (M, K, N), their status (M, K) and residuals (M, K, 2).
+
+    ``first`` (M, N) is ``start`` (M, N) within the limits.
+    """
+    valid = is_pose(search.target, search.constraint) & first.isfinite().all(dim=-1)
     if search.posture is not None:
         valid &= search.posture.isfinite().all(dim=-1)
-    q, residual = first.clone(), torch.full((len(target), 2), torch.inf, dtype=first.dtype, device=first.device)
-    open_rows, begin = valid.nonzero().squeeze(-1), 0
-    for number in rounds:
+    residual = torch.full((len(first), count, 2), torch.inf, dtype=first.dtype, device=first.device)
+    empty = first.unsqueeze(1).repeat(1, count, 1)
+    pool = _Pool(empty, residual, first, speeds(search.arm), revolute(search.arm))
+    whole = search.constraint == "pose" and search.weights is None
+    form = universal(search.arm) if whole else "a part of the pose"
+    known = not isinstance(form, str) and (count > 1 or len(rounds) > 1)
+    # A row is done once its last place is filled; where all solutions are known, once it has one.
+    needed = 0 if known else count - 1
+    open_rows = valid.nonzero().squeeze(-1)
+    if known and count == 1:
+        # Nothing is nearer than to stay.
+        pool.residual[open_rows, 0] = residual_at(search, first[open_rows], open_rows)
+        open_rows = open_rows[search.cost(pool.residual[open_rows, 0]) > 1.0]
+    for stage in _stages(rounds, known=known):
         if not len(open_rows):
             break
-        tries = starts[begin : begin + number].expand(len(open_rows), number, -1)
-        if begin == 0:
-            tries = torch.cat([first[open_rows].unsqueeze(1), tries[:, 1:]], dim=1)
-        begin += number
-        reached, left = _descend(search, target, tries, open_rows)
-        nearer = _cost(search, left) < _cost(search, residual[open_rows])
-        q[open_rows] = torch.where(nearer.unsqueeze(-1), reached, q[open_rows])
-        residual[open_rows] = torch.where(nearer.unsqueeze(-1), left, residual[open_rows])
-        open_rows = open_rows[_cost(search, left) > 1.0]
-    status = torch.where(valid, int(IKStatus.SOLVED), int(IKStatus.INVALID))
-    if len(open_rows):
-        status[open_rows] = _reason(search, q[open_rows], target[open_rows])
-    return q, status, residual
+        if stage is None:
+            assert isinstance(form, Universal)
+            rows, tries = _branch_tries(search, form, first, open_rows)
+        else:
+            rows, tries = open_rows, _start_tries(search, first, open_rows, *stage)
+        # Of several starts that are asked for at once, the nearest solution is wanted and not the first.
+        all_tries = count > 1 or stage is None or stage[0] == 0
+        _put(search, pool, rows, *descend(search, tries, rows, all_tries=all_tries))
+        open_rows = open_rows[search.cost(pool.residual[open_rows, needed]) > 1.0]
+    status = _status(search, pool, valid)
+    pool = _as_started(search, pool, start)
+    return torch.where(valid[:, None, None], pool.q, start.unsqueeze(1)), status, pool.residual
 
 
-def _descend(search: _Search, target: Tensor, tries: Tensor, rows: Tensor) -> tuple[Tensor, Tensor]:
-    """From ``tries`` (A, S, N) towards ``target[rows]``: positions (A, N) and residuals (A, 2) of each row's best try.
+def _stages(rounds: Sequence[int], *, known: bool) -> list[tuple[int, int] | None]:
+    """The first start and the number of starts of each round; None stands for the solutions of `branches`."""
+    stages: list[tuple[int, int] | None] = list(zip(accumulate(rounds, initial=0), rounds, strict=False))
+    return [None, *stages] if known else stages
 
-    A row is left alone from the step at which its first try is within the tolerances.
+
+def _start_tries(search: Search, first: Tensor, rows: Tensor, begin: int, number: int) -> Tensor:
+    """Starts ``begin`` to ``begin + number`` of some rows, ``(A, number, N)``: the row's own, then fixed ones."""
+    unit = _spread(begin + number, search.arm.num_joints)[begin:].to(search.target)
+    low, high = _range(search.arm, *search.bounds(rows))
+    low, high = low.reshape(-1, 1, unit.shape[-1]), high.reshape(-1, 1, unit.shape[-1])
+    tries = (low + (high - low) * unit).expand(len(rows), *unit.shape)
+    return tries if begin else torch.cat([first[rows].unsqueeze(1), tries[:, 1:]], dim=1)
+
+
+def _branch_tries(search: Search, form: Universal, first: Tensor, rows: Tensor) -> tuple[Tensor, Tensor]:
+    """Those of the rows that have analytic solutions, ``(A,)``, and these, ``(A, S, N)``, some repeated."""
+    poses = tool_turns(search.target[rows], search.symmetry)
+    many = rows.repeat_interleave(search.symmetry)
+    q, valid = all_branches(form, search.arm, poses.flatten(0, 1), first[many], *search.bounds(many))
+    q, valid = q.view(len(rows), search.symmetry * NUMBER, 6), valid.view(len(rows), search.symmetry * NUMBER)
+    one = q.gather(1, valid.to(torch.uint8).argmax(dim=1)[:, None, None].expand(-1, 1, 6))
+    has = valid.any(dim=1)
+    return rows[has], torch.where(valid.unsqueeze(-1), q, one)[has]
+
+
+def _put(search: Search, pool: _Pool, rows: Tensor, q: Tensor, residual: Tensor) -> None:
+    """Keep in ``pool`` the nearest of what ``rows`` had and of ``q`` (A, S, N) with ``residual`` (A, S, 2)."""
+    start, number = pool.start[rows].unsqueeze(1), pool.q.shape[1]
+    lower, upper = (limit.reshape(-1, 1, q.shape[-1]) for limit in search.bounds(rows))
+    q = torch.where(pool.turns, turned_towards(q, start, lower, upper), q)
+    q, residual = torch.cat([pool.q[rows], q], dim=1), torch.cat([pool.residual[rows], residual], dim=1)
+    cost = search.cost(residual)
+    # What is not solved comes after all that is.
+    key = torch.where(cost <= 1.0, travel(q, start, pool.speed), 1e6 * cost)
+    picked = first_distinct(q, key, number, pool.turns)
+    index = picked.clamp_min(0).unsqueeze(-1)
+    q, residual = q.gather(1, index.expand(-1, -1, q.shape[-1])), residual.gather(1, index.expand(-1, -1, 2))
+    if number > 1:
+        empty = (picked < 0).unsqueeze(-1) | (search.cost(residual) > 1.0).unsqueeze(-1)
+        empty[:, 0] = False
+        q, residual = torch.where(empty, q[:, :1], q), residual.masked_fill(empty, torch.inf)
+    pool.q[rows], pool.residual[rows] = q, residual
+
+
+def _as_started(search: Search, pool: _Pool, start: Tensor) -> _Pool:
+    """The pool with endless joints as many turns on as ``start`` (M, N) is from the pool's own start.
+
+    Turned so far that a solution's rounding would pass the tolerances, it stays as it is.
     """
-    count, number, joints = tries.shape
-    best = tries[:, 0].clone()
-    residual = torch.full((count, 2), torch.inf, dtype=best.dtype, device=best.device)
-    here, q = torch.arange(count, device=rows.device), tries.reshape(-1, joints)
-    for iteration in range(search.iterations + 1):
-        index = rows[here].repeat_interleave(number)
-        wanted = target[index]
-        pose, jacobian = _evaluate(search.arm, q)
-        error = constraint_error(pose, wanted, constraint=search.constraint, symmetry=search.symmetry)
-        left = torch.stack([error[:, :3].norm(dim=-1), error[:, 3:].norm(dim=-1)], dim=-1).view(-1, number, 2)
-        cost, chosen = _cost(search, left).min(dim=1)
-        nearer = cost < _cost(search, residual[here])
-        row = torch.arange(len(here), device=here.device)
-        best[here] = torch.where(nearer.unsqueeze(-1), q.view(-1, number, joints)[row, chosen], best[here])
-        residual[here] = torch.where(nearer.unsqueeze(-1), left[row, chosen], residual[here])
-        going = cost > 1.0
-        if iteration == search.iterations or not bool(going.any()):
-            break
-        rows_jacobian = constraint_jacobian(jacobian, wanted, constraint=search.constraint)
-        q = _stepped(search, q, rows_jacobian, error, None if search.posture is None else search.posture[index])
-        here, q = here[going], q.view(-1, number, joints)[going].reshape(-1, joints)
-    return best, residual
+    arm = search.arm
+    endless = pool.turns & arm.lower.isinf() & arm.upper.isinf()
+    away = torch.where(endless, start.double() - pool.start.double(), 0.0).nan_to_num(0.0, 0.0, 0.0)
+    if not bool((away != 0.0).any()):
+        return pool
+    q = (pool.q.double() + TURN * (away / TURN).round().unsqueeze(1)).to(pool.q.dtype)
+    rows = torch.arange(len(q), device=q.device).repeat_interleave(q.shape[1])
+    residual = residual_at(search, reduced(arm, q).flatten(0, 1), rows).view(pool.residual.shape)
+    kept = (search.cost(residual) <= 1.0) | (search.cost(pool.residual) > 1.0)
+    kept = kept.unsqueeze(-1)
+    residual = torch.where(kept & pool.residual.isfinite(), residual, pool.residual)
+    return pool._replace(q=torch.where(kept, q, pool.q), residual=residual)
 
 
-def _stepped(search: _Search, q: Tensor, jacobian: Tensor, error: Tensor, posture: Tensor | None) -> Tensor:
-    """One step of Levenberg and Marquardt (Sugihara 2011: λ² grows with the error), within limits of step and joint."""
-    square = (error * error).sum(dim=-1)
-    damping = (0.1 * square + _least_damping(q.dtype)).sqrt()
-    preferred = None if posture is None else 0.3 * (posture - q)
-    step = dls_step(jacobian, error, damping, preferred=preferred)
-    worst = (step.abs() / search.max_step).amax(dim=-1, keepdim=True)
-    return torch.clamp(q + step / worst.clamp_min(1.0), search.arm.lower, search.arm.upper)
+def _status(search: Search, pool: _Pool, valid: Tensor) -> Tensor:
+    """Status ``(M, K)`` of what the pool holds."""
+    solved = search.cost(pool.residual) <= 1.0
+    status = torch.where(solved, int(IKStatus.SOLVED), int(IKStatus.UNREACHED))
+    failed = (valid & ~solved[:, 0]).nonzero().squeeze(-1)
+    if len(failed):
+        status[failed] = reason(search, pool.q[failed, 0], failed).unsqueeze(-1)
+    return status.masked_fill(~valid.unsqueeze(-1), int(IKStatus.INVALID))
 
 
-def _least_damping(dtype: torch.dtype) -> float:
-    """λ² at the target: what keeps the squares of singular values apart from rounding."""
-    return 1e-8 if dtype == torch.float64 else 1e-5
-
-
-def _evaluate(arm: Arm, q: Tensor) -> tuple[Tensor, Tensor]:
-    """Poses and Jacobians for ``(M, N)``, by products of always `BLOCK` rows."""
-    padded = torch.nn.functional.pad(q, (0, 0, 0, -len(q) % BLOCK))
-    parts = [arm.pose_and_jacobian(block) for block in padded.split(BLOCK)]
-    pose, jacobian = (torch.cat(part)[: len(q)] for part in zip(*parts, strict=True))
-    return pose, jacobian
-
-
-def _cost(search: _Search, residual: Tensor) -> Tensor:
-    """Residuals ``(*B, 2)`` in units of their tolerances, the worse of both: at most 1 where solved."""
-    place, direction = search.tolerances
-    return torch.maximum(residual[..., 0] / place, residual[..., 1] / direction)
-
-
-def _is_pose(target: Tensor, constraint: str) -> Tensor:
-    """Whether targets ``(M, 4, 4)`` are finite, and their rotations orthonormal where the constraint has any."""
-    finite = target.isfinite().all(dim=-1).all(dim=-1)
-    if constraint == "position":
-        return finite
-    rotation = target[:, :3, :3]
-    off = rotation.mT @ rotation - torch.eye(3, dtype=target.dtype, device=target.device)
-    right_handed = (torch.linalg.cross(rotation[..., 0], rotation[..., 1]) * rotation[..., 2]).sum(dim=-1) > 0.0
-    return finite & (off.abs().amax(dim=(-2, -1)) < 1e-3) & right_handed
-
-
-def _reason(search: _Search, q: Tensor, target: Tensor) -> Tensor:
-    """Status (M,) of rows that were not solved."""
-    _, jacobian = _evaluate(search.arm, q)
-    values = torch.linalg.svdvals(constraint_jacobian(jacobian, target, constraint=search.constraint))
-    at_limit = ((q <= search.arm.lower) | (q >= search.arm.upper)).any(dim=-1)
+def reason(search: Search, q: Tensor, rows: Tensor) -> Tensor:
+    """Status ``(A,)`` of rows that were not solved and came to ``q`` (A, N)."""
+    _, jacobian = evaluate(search.arm, q)
+    values = torch.linalg.svdvals(rows_at(search, jacobian, rows))
+    lower, upper = search.bounds(rows)
+    at_limit = ((q <= lower) | (q >= upper)).any(dim=-1)
     status = torch.where(at_limit, int(IKStatus.LIMITED), int(IKStatus.UNREACHED))
     return torch.where(values[:, -1] < 0.02 * values[:, 0], int(IKStatus.SINGULAR), status)

@@ -7,10 +7,52 @@ import math
 import torch
 from torch import Tensor
 
+from torchdyn_plan.checks import check_same_device, check_trailing_shape
+from torchdyn_plan.errors import InputError
+from torchdyn_plan.kinematics.arm import Arm
 from torchdyn_plan.precision import autocast_is_on, without_autocast
 
 CONSTRAINTS = {"pose": 6, "axis": 5, "position": 3}
 """Directions that each constrains: the whole pose, place and direction of the tool's z axis, place."""
+
+
+def as_pose(target: Tensor, arm: Arm, constraint: str, *, name: str = "target") -> Tensor:
+    """``target`` as poses ``(*B, 4, 4)``, checked; ``(*B, 3)`` will do for a position."""
+    if constraint == "position" and isinstance(target, Tensor) and target.shape[-1:] == (3,):
+        check_like(name, target, arm)
+        place = target.unsqueeze(-1)
+        eye = torch.eye(4, dtype=target.dtype, device=target.device).expand(*place.shape[:-2], 4, 4)
+        return torch.cat([eye[..., :3], torch.cat([place, torch.ones_like(place[..., :1, :])], dim=-2)], dim=-1)
+    check_trailing_shape(name, target, 4, 4)
+    check_like(name, target, arm)
+    return target
+
+
+def as_rows(name: str, value: Tensor, arm: Arm, batch: torch.Size) -> Tensor:
+    """Joint positions ``(*B, N)`` or ``(N,)`` as rows ``(M, N)``, checked."""
+    check_trailing_shape(name, value, arm.num_joints)
+    check_like(name, value, arm)
+    if value.shape[:-1] not in (batch, torch.Size()):
+        check_trailing_shape(name, value, *batch, arm.num_joints)
+    return value.detach().expand(*batch, arm.num_joints).reshape(-1, arm.num_joints)
+
+
+def check_like(name: str, value: Tensor, arm: Arm) -> None:
+    """Raise `InputError` unless ``value`` is of the arm's device and precision."""
+    check_same_device(name, value, arm.lower.device, "the arm")
+    if value.dtype != arm.lower.dtype:
+        raise InputError(f"{name} is {value.dtype}, but the arm is {arm.lower.dtype}: convert one of them")
+
+
+def is_pose(target: Tensor, constraint: str) -> Tensor:
+    """Whether targets ``(M, 4, 4)`` are finite, and their rotations orthonormal where the constraint has any."""
+    finite = target.isfinite().all(dim=-1).all(dim=-1)
+    if constraint == "position":
+        return finite
+    rotation = target[:, :3, :3]
+    off = rotation.mT @ rotation - torch.eye(3, dtype=target.dtype, device=target.device)
+    right_handed = (torch.linalg.cross(rotation[..., 0], rotation[..., 1]) * rotation[..., 2]).sum(dim=-1) > 0.0
+    return finite & (off.abs().amax(dim=(-2, -1)) < 1e-3) & right_handed
 
 
 def constraint_error(pose: Tensor, target: Tensor, *, constraint: str = "pose", symmetry: int = 1) -> Tensor:
@@ -67,6 +109,15 @@ def rotation_vector(rotation: Tensor) -> Tensor:
     cosine = 0.5 * (rotation.diagonal(dim1=-2, dim2=-1).sum(dim=-1, keepdim=True) - 1.0)
     vector = sine * _angle_over_sine(sine, cosine)
     return torch.where(cosine < -0.998, _near_half_turn(rotation, sine, cosine), vector)
+
+
+def rotation_matrix(vector: Tensor) -> Tensor:
+    """The rotation ``(*B, 3, 3)`` whose axis times angle is ``vector`` (*B, 3) [rad]: `rotation_vector` undone."""
+    angle = vector.norm(dim=-1).clamp_min(torch.finfo(vector.dtype).tiny)[..., None, None]
+    eye = torch.eye(3, dtype=vector.dtype, device=vector.device)
+    cross = torch.linalg.cross(vector.unsqueeze(-2).expand(*vector.shape, 3), eye.expand(*vector.shape, 3)).mT
+    # sin(θ)/θ and (1 - cos(θ))/θ² = ½ (sin(½θ)/(½θ))².
+    return eye + torch.sinc(angle / math.pi) * cross + 0.5 * torch.sinc(angle / (2.0 * math.pi)) ** 2 * cross @ cross
 
 
 def _angle_over_sine(sine: Tensor, cosine: Tensor) -> Tensor:

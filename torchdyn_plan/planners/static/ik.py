@@ -12,10 +12,11 @@ from torch import Tensor, nn
 from torch.func import debug_unwrap
 
 from torchdyn_plan import keys
-from torchdyn_plan.checks import check_finite, check_number, check_trailing_shape
+from torchdyn_plan.checks import check_finite, check_number, check_trailing_shape, hides_values
 from torchdyn_plan.errors import InputError
 from torchdyn_plan.kinematics.arm import Arm
 from torchdyn_plan.kinematics.components import Vector, damped_least_squares
+from torchdyn_plan.kinematics.descent import evaluate
 from torchdyn_plan.kinematics.dls import dls_step, limited_step
 from torchdyn_plan.kinematics.fused import Columns, Fused, filled
 from torchdyn_plan.planners.memory import remember, warn_of_loss
@@ -36,6 +37,8 @@ class Path(NamedTuple):
     """``(*B, 3)`` where it leads [m, world]."""
 
 
+PASSES = 2
+"""Times that a step is solved anew without the joints that it would push out of their limits."""
 PATH_NAMES = tuple(f"path_{field}" for field in Path._fields)
 
 
@@ -78,6 +81,7 @@ class IKPlanner(Precise, StaticPlannerModule):
         super().__init__()
         if not isinstance(arm, Arm):
             raise InputError(f"arm must be an Arm, as from Arm.from_urdf or Arm.ur5, got {type(arm).__name__}")
+        _check_speeds(arm)
         if chunk is not None:
             check_number("chunk", chunk, minimum=1, integer=True)
         remembered: list[Any] = [(keys.PLAN, name) for name in PATH_NAMES]
@@ -166,25 +170,54 @@ class IKPlanner(Precise, StaticPlannerModule):
         joint_pos, goal = joint_pos.to(self._limit.dtype), goal.to(self._limit.dtype)
         if self._fused is not None:
             if joint_pos.ndim == 2:
-                action, reached = self._fused(joint_pos, goal)
-                return action, reached
-            rows = self._fused(joint_pos.reshape(-1, joint_pos.shape[-1]), goal.reshape(-1, 3))
+                return self._step_fused(joint_pos, goal)
+            rows = self._step_fused(joint_pos.reshape(-1, joint_pos.shape[-1]), goal.reshape(-1, 3))
             action, reached = (value.reshape(joint_pos.shape) for value in rows)
             return action, reached
         if joint_pos.ndim == 2 and (self.chunk is None or len(joint_pos) <= self.chunk):
             pose, jacobian = self.arm.form.pose_and_jacobian(joint_pos)
         else:
             pose, jacobian = self._pose_and_jacobian(joint_pos)
+        return self._step_from(joint_pos, goal, pose, jacobian)
+
+    def _step_from(self, joint_pos: Tensor, goal: Tensor, pose: Tensor, jacobian: Tensor) -> tuple[Tensor, Tensor]:
+        """`step` where the tool's pose and Jacobian are known."""
         error = torch.stack(self.approach.twist(pose.flatten(-2).unbind(-1), goal.unbind(-1)), dim=-1)
         rows = jacobian if error.shape[-1] == 6 else jacobian[..., : error.shape[-1], :]
         # A module's attribute that is a buffer takes as long to look up as a small operation; its table does not.
         limit, bounds = cast(Tensor, self._buffers["_limit"]), cast(dict[str, Tensor], self.arm._buffers)
-        step = limited_step(dls_step(rows, error, self.damping), limit, self.gain)
-        step = torch.clamp(step, bounds["lower"] - joint_pos, bounds["upper"] - joint_pos)
+        low, high = bounds["lower"] - joint_pos, bounds["upper"] - joint_pos
+        whole = dls_step(rows, error, self.damping)
+        wanted = limited_step(whole, limit, self.gain)
+        step = torch.clamp(wanted, low, high)
+        # Where nothing was cut off, no joint is pushed out of its limits.
+        if hides_values(step) or not torch.equal(step, wanted):
+            whole = self._without_held(whole, rows, error, low, high)
+            step = torch.clamp(limited_step(whole, limit, self.gain), low, high)
         return (step / limit).clamp(-1.0, 1.0), joint_pos + step
 
-    def _fused_step(self, joint_pos: Columns, goal: Columns) -> tuple[Vector, Vector]:
-        """`step`, column by column."""
+    def _without_held(self, whole: Tensor, rows: Tensor, error: Tensor, low: Tensor, high: Tensor) -> Tensor:
+        """``whole``, a step (*B, N), by the joints that may move: those at a limit that it pushes out are left out."""
+        at_lower, at_upper = low >= 0.0, high <= 0.0
+        held = torch.zeros_like(at_lower)
+        for _ in range(PASSES):
+            held = held | (at_lower & (whole < 0.0)) | (at_upper & (whole > 0.0))
+            again = dls_step(rows.masked_fill(held.unsqueeze(-2), 0.0), error, self.damping)
+            whole = torch.where(held.any(dim=-1, keepdim=True), again, whole)
+        return whole
+
+    def _step_fused(self, joint_pos: Tensor, goal: Tensor) -> tuple[Tensor, Tensor]:
+        """`step` of rows in one compiled loop; rows that push a joint out of its limits are stepped anew."""
+        assert self._fused is not None
+        action, reached, pushed = self._fused(joint_pos, goal)
+        if pushed.sum().item():
+            rows = pushed.squeeze(-1).nonzero().squeeze(-1)
+            joint_pos, goal = joint_pos[rows], goal[rows]
+            action[rows], reached[rows] = self._step_from(joint_pos, goal, *evaluate(self.arm, joint_pos))
+        return action, reached
+
+    def _fused_step(self, joint_pos: Columns, goal: Columns) -> tuple[Vector, Vector, Vector]:
+        """`step`, column by column, all joints taking part; and 1 in rows where one at its limit should not have."""
         rotation, place, jacobian = self.arm.components(joint_pos)
         pose = [entry for row, end in zip(rotation, place, strict=True) for entry in (*row, end)]
         error = self.approach.twist([filled(entry, joint_pos[0]) for entry in pose], goal)
@@ -195,9 +228,11 @@ class IKPlanner(Precise, StaticPlannerModule):
         share = (1.0 / worst.clamp_min(1e-12)).clamp(max=self.gain)
         bounds = zip(joint_pos, lower, upper, strict=True)
         ways = [(low - here, high - here) for here, low, high in bounds]
+        out = [((low >= 0.0) & (value < 0.0)) | ((high <= 0.0) & (value > 0.0)) for value, (low, high) in zip(step, ways, strict=True)]
+        pushed = functools.reduce(torch.logical_or, out).to(goal[0].dtype)
         step = [torch.clamp(value * share, *way) for value, way in zip(step, ways, strict=True)]
         action = [(value / most).clamp(-1.0, 1.0) for value, most in zip(step, limit, strict=True)]
-        return action, [here + value for here, value in zip(joint_pos, step, strict=True)]
+        return action, [here + value for here, value in zip(joint_pos, step, strict=True)], [pushed]
 
     def _pose_and_jacobian(self, joint_pos: Tensor) -> tuple[Tensor, Tensor]:
         """The arm's, from products of always ``chunk`` rows where ``joint_pos`` is a multiple of them."""
@@ -205,3 +240,14 @@ class IKPlanner(Precise, StaticPlannerModule):
             return self.arm.pose_and_jacobian(joint_pos)
         pose, jacobian = zip(*map(self.arm.pose_and_jacobian, joint_pos.split(self.chunk)), strict=True)
         return torch.cat(pose), torch.cat(jacobian)
+
+
+def _check_speeds(arm: Arm) -> None:
+    """Raise `InputError` unless every joint has a speed limit, of which actions are shares."""
+    limits = zip(arm.joint_names, arm.speed_limit.tolist(), strict=True)
+    without = [name or f"number {index}" for index, (name, limit) in enumerate(limits) if not 0.0 < limit < math.inf]
+    if without:
+        raise InputError(
+            f"the arm has no speed limit for {', '.join(map(repr, without))}, and actions are shares of it: give "
+            "speed_limit= [rad/s; m/s] where the arm is made"
+        )

@@ -1,0 +1,214 @@
+"""Along a path of poses: joint positions within the limits of place and speed, a step of time after the other."""
+
+from __future__ import annotations
+
+import math
+from typing import NamedTuple
+
+import torch
+from torch import Tensor
+
+from torchdyn_plan.checks import check_choice, check_number
+from torchdyn_plan.errors import InputError
+from torchdyn_plan.kinematics.arm import Arm
+from torchdyn_plan.kinematics.descent import Search, descend, evaluate, residual_at
+from torchdyn_plan.kinematics.nearest import speeds
+from torchdyn_plan.kinematics.solver import IKResult, IKStatus, inside_limits, reason, solve_rows
+from torchdyn_plan.kinematics.targets import CONSTRAINTS, as_pose, as_rows, is_pose
+from torchdyn_plan.precision import without_autocast
+
+TIGHT = 0.1
+"""Share of the tolerances at which a step ends, so that a slow target is followed and not stepped after."""
+PATIENCE = 5
+"""Steps after which a row that does not come to its target looks for another way to it, each time."""
+RESTARTS = (1, 16)
+"""Starts of such a search."""
+
+
+class _State(NamedTuple):
+    """Where each row stands."""
+
+    q: Tensor
+    """``(M, N)``, the joints."""
+    reference: Tensor
+    """``(M, N)``, where they are going to while they change over."""
+    changing: Tensor
+    """``(M,)`` bool: on the way to another solution."""
+    late: Tensor
+    """``(M,)`` int64, steps since the joints were at the target."""
+    target: Tensor
+    """``(M, 4, 4)``, the last pose that was one."""
+
+
+def follow(
+    arm: Arm,
+    poses: Tensor,
+    q0: Tensor,
+    dt: float,
+    *,
+    constraint: str = "pose",
+    symmetry: int = 1,
+    position_tolerance: float = 1e-3,
+    rotation_tolerance: float = math.radians(0.5),
+    iterations: int = 8,
+    posture: Tensor | None = None,
+) -> IKResult:
+    """Joint positions that follow ``poses`` from ``q0`` on, within the limits of place and of speed at every step.
+
+    At every step the joints go as near to the pose as can be reached in ``dt``: first by what the target has moved (its
+    velocity, fed forward) and what was left before, then by what corrects that. Of the motions that would do, slow
+    joints take less. A joint at a limit, of place or of speed, is left out, and the others do the work. A row that
+    does not come to its target for `PATIENCE` steps changes over to the nearest other solution, straight and as fast
+    as its slowest joint allows, while the target moves on.
+
+    Args:
+        arm: whose tool it is. Joints without a speed limit are as fast as they like.
+        poses: ``(*B, T, 4, 4)``, base frame [m], the first to be reached after ``dt``; ``(*B, T, 3)`` will do for the
+            constraint "position".
+        q0: ``(*B, N)`` or ``(N,)``, the joints before the first step. From outside their limits they come back as fast
+            as they can, and no step is `SOLVED` before they have.
+        dt: time of a step [s].
+        constraint: as of `solve_ik`.
+        symmetry: as of `solve_ik`.
+        position_tolerance: [m]
+        rotation_tolerance: [rad]
+        iterations: most steps towards each pose.
+        posture: ``(*B, N)`` or ``(N,)``, to which the motion that the constraint leaves free is drawn.
+
+    Returns:
+        As of `solve_ik`, with the time before the last dimensions: ``q`` (*B, T, N), ``status`` (*B, T), and
+        ``residual`` (*B, T, 2). At a pose that is not one the joints stay; the row goes on after it.
+
+    Raises:
+        InputError: a shape, device, precision, name or number is wrong.
+    """
+    check_choice("constraint", constraint, CONSTRAINTS)
+    check_number("symmetry", symmetry, minimum=1, integer=True)
+    check_number("iterations", iterations, minimum=1, integer=True)
+    check_number("dt", dt, minimum=1e-9)
+    poses = as_pose(poses, arm, constraint, name="poses")
+    if poses.ndim < 3:
+        raise InputError(f"poses must have shape (*B, T, 4, 4), got {tuple(poses.shape)}")
+    batch, steps = poses.shape[:-3], poses.shape[-3]
+    with torch.no_grad():
+        start = as_rows("q0", q0, arm, batch)
+        rows = poses.detach().reshape(len(start), steps, 4, 4)
+        posture = None if posture is None else as_rows("posture", posture, arm, batch)
+        tolerances = position_tolerance, rotation_tolerance
+        search = following(arm, constraint, symmetry, tolerances, iterations)._replace(posture=posture)
+        found = without_autocast(follow_rows, search, rows, start, arm.speed_limit * dt)
+    q, status, residual = found
+    return IKResult(q.view(*batch, steps, arm.num_joints), status.view(*batch, steps), residual.view(*batch, steps, 2))
+
+
+def following(
+    arm: Arm, constraint: str, symmetry: int, tolerances: tuple[float, float], iterations: int
+) -> Search:
+    """A search of poses that are yet to come."""
+    speed, none = speeds(arm), arm.lower.new_zeros(0, 4, 4)
+    step = torch.ones_like(speed)
+    ease = None if bool((speed == speed[0]).all()) else speed / speed.max()
+    search = Search(arm, none, arm.lower, arm.upper, constraint, symmetry, tolerances, iterations, step)
+    return search._replace(ease=ease)
+
+
+def follow_rows(
+    search: Search, poses: Tensor, start: Tensor, reach: Tensor, *, patience: int = PATIENCE
+) -> tuple[Tensor, Tensor, Tensor]:
+    """`follow` for rows: ``poses`` (M, T, 4, 4) from ``start`` (M, N), by at most ``reach`` (N,) a step."""
+    count, steps, joints = len(start), poses.shape[1], start.shape[1]
+    q, residual = start.new_empty(count, steps, joints), start.new_empty(count, steps, 2)
+    status = torch.empty(count, steps, dtype=torch.int64, device=start.device)
+    good = start.isfinite().all(dim=-1)
+    inside = torch.where(good.unsqueeze(-1), torch.clamp(start, search.arm.lower, search.arm.upper), _finite(search.arm))
+    outside = good & (inside != start).any(dim=-1)
+    late = torch.zeros(count, dtype=torch.int64, device=start.device)
+    state = _State(start, inside, outside, late, evaluate(search.arm, inside)[0])
+    for step in range(steps):
+        valid = good & is_pose(poses[:, step], search.constraint)
+        state = _advance(search, state, poses[:, step], valid, reach, patience)
+        q[:, step] = state.q
+        status[:, step], residual[:, step] = _told(search, state, valid)
+    return q, status, residual
+
+
+def _advance(
+    search: Search, state: _State, target: Tensor, valid: Tensor, reach: Tensor, patience: int
+) -> _State:
+    """The state one step of time later."""
+    search = search._replace(target=torch.where(valid[:, None, None], target, state.target))
+    q, reference, changing, late = (value.clone() for value in state[:4])
+    rows = (valid & ~changing).nonzero().squeeze(-1)
+    if len(rows):
+        q[rows], solved = _follow_on(search, q[rows], rows, reach)
+        late[rows] = torch.where(solved, 0, late[rows] + 1)
+        reference[rows] = q[rows]
+    lost = (valid & ~changing & (late > 0) & (late % patience == 0)).nonzero().squeeze(-1)
+    if len(lost):
+        reference[lost], changing[lost] = _another_way(search, state.q[lost], lost)
+        q[lost] = torch.where(changing[lost].unsqueeze(-1), _towards(state.q[lost], reference[lost], reach), q[lost])
+    rows = (valid & state.changing).nonzero().squeeze(-1)
+    if len(rows):
+        reference[rows] = descend(_tight(search), reference[rows].unsqueeze(1), rows)[0].squeeze(1)
+        q[rows] = _towards(q[rows], reference[rows], reach)
+    changing &= (q != reference).any(dim=-1)
+    return _State(q, reference, changing, late, search.target)
+
+
+def _tight(search: Search) -> Search:
+    return search._replace(tolerances=(TIGHT * search.tolerances[0], TIGHT * search.tolerances[1]))
+
+
+def _follow_on(search: Search, q: Tensor, rows: Tensor, reach: Tensor) -> tuple[Tensor, Tensor]:
+    """The nearest to the target that can be reached from ``q`` (A, N) in one step, and whether it is there, ``(A,)``."""
+    most = _within(q, reach)
+    lower, upper = torch.maximum(search.arm.lower, q - most), torch.minimum(search.arm.upper, q + most)
+    part = _rows_of(search, rows)._replace(lower=lower, upper=upper)
+    found, residual = descend(_tight(part), q.unsqueeze(1), torch.arange(len(rows), device=rows.device))
+    return found.squeeze(1), search.cost(residual.squeeze(1)) <= 1.0
+
+
+def _another_way(search: Search, q: Tensor, rows: Tensor) -> tuple[Tensor, Tensor]:
+    """The solution nearest to ``q`` (A, N), and whether there is one, ``(A,)``."""
+    found, status, _ = solve_rows(_rows_of(search, rows), q, inside_limits(search.arm, q), RESTARTS, 1)
+    solved = status.squeeze(1) == IKStatus.SOLVED
+    return torch.where(solved.unsqueeze(-1), found.squeeze(1), q), solved
+
+
+def _rows_of(search: Search, rows: Tensor) -> Search:
+    """The search of some rows alone."""
+    posture = None if search.posture is None else search.posture[rows]
+    weights = None if search.weights is None else search.weights[rows]
+    return search._replace(target=search.target[rows], posture=posture, weights=weights)
+
+
+def _within(q: Tensor, reach: Tensor) -> Tensor:
+    """The most that joints at ``q`` (*B, N) move: ``reach`` (N,), less what rounding may add."""
+    eps = torch.finfo(q.dtype).eps
+    return (reach - 4.0 * eps * (q.abs() + reach.nan_to_num(posinf=0.0))).clamp_min(0.0)
+
+
+def _towards(q: Tensor, reference: Tensor, reach: Tensor) -> Tensor:
+    """``q`` (M, N) moved to ``reference`` (M, N), or on the straight way there by at most ``reach`` (N,)."""
+    way = reference - q
+    worst = (way.abs() / _within(q, reach).clamp_min(torch.finfo(q.dtype).tiny)).amax(dim=-1, keepdim=True)
+    return torch.where(worst <= 1.0, reference, q + way / worst.clamp_min(1.0))
+
+
+def _told(search: Search, state: _State, valid: Tensor) -> tuple[Tensor, Tensor]:
+    """Status ``(M,)`` and residual ``(M, 2)`` of where the joints are."""
+    search = search._replace(target=state.target)
+    every = torch.arange(len(valid), device=valid.device)
+    q = torch.where(valid.unsqueeze(-1), state.q, state.reference)
+    residual = residual_at(search, q, every)
+    solved = search.cost(residual) <= 1.0
+    outside = ((q < search.arm.lower) | (q > search.arm.upper)).any(dim=-1)
+    status = torch.where(solved, int(IKStatus.SOLVED), int(IKStatus.LATE))
+    status[outside] = int(IKStatus.LIMITED)
+    status[~valid] = int(IKStatus.INVALID)
+    return status, residual.masked_fill(~valid.unsqueeze(-1), torch.inf)
+
+
+def _finite(arm: Arm) -> Tensor:
+    """Some positions within the limits, ``(N,)``."""
+    return torch.clamp(torch.zeros_like(arm.lower), arm.lower, arm.upper)
