@@ -182,7 +182,7 @@ def best_form(joints: Sequence[Joint], tool: Tensor) -> SineForm | TransformForm
 
 
 def best_cuts(count: int, sines: dict[tuple[int, int], int], most: int) -> tuple[int, ...]:
-    """Where to cut a chain of ``count`` joints: into the fewest parts, at least two, with at most ``most`` sines in all.
+    """Where to cut a chain of ``count`` joints: into the fewest parts, at least two, with no more than ``most`` sines.
 
     Of as many parts those with the fewest sines are taken, and of these the first in order; if all cuts have more than
     ``most``, those with the fewest. By dynamic programming over the number of parts and the first joint of a tail.

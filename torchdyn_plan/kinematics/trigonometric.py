@@ -116,9 +116,7 @@ def trigonometric_form(
     return _real_form(entries, negligible, slopes if bool(slopes.any()) else None)
 
 
-def sine_counts(
-    joints: Sequence[Joint], tools: Iterable[Tensor], *, negligible: float, most: int
-) -> Iterator[int]:
+def sine_counts(joints: Sequence[Joint], tools: Iterable[Tensor], *, negligible: float, most: int) -> Iterator[int]:
     """How many sines the `trigonometric_form` has of the first joint of a chain, of the first two, and so on.
 
     Counting takes a fraction of the time of the forms. A frequency has a cosine where any of its entries has a real
