@@ -66,6 +66,8 @@ def _parsed(source: Source) -> Element:
 
 
 def _robot(root: Element) -> _Robot:
+    if root.find("link") is None:
+        raise InputError("the URDF text declares no link")
     joints, by_child = root.findall("joint"), {}
     for joint in joints:
         by_child.setdefault(_end(joint, "child"), []).append(joint)
