@@ -67,8 +67,9 @@ AXES = st.one_of(
     VECTORS.filter(lambda axis: sum(x * x for x in axis) > 0.01),
 )
 KINDS = st.sampled_from(["revolute"] * 4 + ["prismatic", "fixed"])
-ROWS = st.builds(Row, VECTORS, TURNS, KINDS, AXES)
-MOVING = st.builds(Row, VECTORS, TURNS, st.just("revolute"), AXES)
+LIMITS = {"lower": st.floats(-3, -1), "upper": st.floats(1, 3)}
+ROWS = st.builds(Row, VECTORS, TURNS, KINDS, AXES, **LIMITS)
+MOVING = st.builds(Row, VECTORS, TURNS, st.just("revolute"), AXES, **LIMITS)
 
 
 @settings(max_examples=40, deadline=None)

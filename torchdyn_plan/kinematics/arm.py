@@ -2,35 +2,50 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
+from dataclasses import replace
 from typing import TYPE_CHECKING, Any, cast
 
 import torch
 from torch import Tensor
 
-from torchdyn_plan.checks import check_choice, check_same_device, check_trailing_shape
+from torchdyn_plan.checks import check_choice, check_finite, check_same_device, check_trailing_shape
 from torchdyn_plan.errors import InputError
 from torchdyn_plan.kinematics.components import ComponentForm
-from torchdyn_plan.kinematics.descriptions import joints_of_chain, joints_of_mjcf, joints_of_urdf
+from torchdyn_plan.kinematics.coupling import CoupledComponents, CoupledForm, drivers_of, full_turns
+from torchdyn_plan.kinematics.descriptions import Source, joints_of_chain
 from torchdyn_plan.kinematics.forms import FORMS, SineForm, TransformForm
-from torchdyn_plan.kinematics.joint import Joint, merge_fixed
+from torchdyn_plan.kinematics.joint import Joint, check_limits, merge_fixed
+from torchdyn_plan.kinematics.mjcf import joints_of_mjcf
 from torchdyn_plan.kinematics.ur5 import UR5_SPEED_LIMIT, ur5_urdf
+from torchdyn_plan.kinematics.urdf import joints_of_urdf
 from torchdyn_plan.precision import Precise
 
 if TYPE_CHECKING:
     import pytorch_kinematics
 
+    from torchdyn_plan.kinematics.mjcf import MjcfSource
+
 
 class Arm(Precise):
-    """A serial chain of N revolute and prismatic joints, parsed by pytorch-kinematics and evaluated in closed form.
+    """A serial chain of N revolute and prismatic joints, read from a description and evaluated in closed form.
 
     It computes in float32 or float64; ``half()`` leaves it in float32.
-    The buffers ``lower``, ``upper`` (N,) [rad; m] and ``speed_limit`` (N,) [rad/s; m/s] hold the joints' limits.
+    The buffers ``lower``, ``upper`` (N,) [rad; m] and ``speed_limit`` (N,) [rad/s; m/s] hold the joints' limits; a
+    speed limit that a description does not give is infinite, and `needed_speed_limit` is what to ask for it.
+
+    Where one joint of the chain moves with another, at ratio · q + shift (`Coupling`), the arm has one position for
+    both, named after the joint that moves the other, with limits that hold for both.
+
+    ``joint_names``, ``joint_kinds`` and ``full_turns`` (whether a full turn leaves the pose as it is) tell of the N
+    positions.
 
     ``form`` says how the arm is evaluated; all forms are exact, and the attribute of that name does the work:
 
     - ``"sines"``: pose and Jacobian as one product of sines, the fastest as long as there are few of them: 81 for a
-      UR5, about a thousand for a general seven-joint arm. Prismatic joints must come before the revolute ones.
+      UR5, about a thousand for a general seven-joint arm, and never more than `trigonometric.MOST_TERMS` terms.
+      Prismatic joints must come before the revolute ones.
     - ``"transforms"``: the product of a few transforms, each of some neighbouring joints and itself made of sines.
     - ``"auto"`` (default): sines, unless there would be more than `forms.MOST_SINES` of them or there cannot be any.
 
@@ -45,36 +60,50 @@ class Arm(Precise):
         self,
         joints: Sequence[Joint],
         *,
-        speed_limit: float | None = None,
+        tool: Tensor | Sequence[Sequence[float]] | None = None,
+        speed_limit: float | Sequence[float] | None = None,
         form: str = "auto",
         dtype: torch.dtype = torch.float32,
         device: torch.device | str | None = None,
     ) -> None:
-        """Build from ``joints``, base to tip; ``speed_limit`` [rad/s; m/s] replaces their own.
+        """Build from ``joints``, base to tip.
 
-        Where offsets of joints require gradients, pose and Jacobian have gradients in them.
+        Where offsets of joints or the tool require gradients, pose and Jacobian have gradients in them.
+
+        Args:
+            joints: base to tip.
+            tool: ``(4, 4)``, pose of the tool in the frame behind the last joint [m]; that frame itself by default.
+            speed_limit: replaces the joints' own, one for all or one for each [rad/s; m/s].
+            form: see above.
+            dtype: torch.float32 or torch.float64.
+            device: CPU by default.
 
         Raises:
-            InputError: no joint moves, the form is unknown, or a prismatic joint cannot be had in sines.
+            InputError: no joint moves, a joint's numbers cannot be, the form is unknown, a prismatic joint cannot be
+                had in sines, or there would be too many of them.
         """
         super().__init__()
         check_choice("form", form, FORMS)
-        moving, tool = merge_fixed(joints)
+        moving, end = merge_fixed(joints if tool is None else [*joints, Joint(offset=_tool(tool), name="tool")])
         if not moving:
             raise InputError("the chain has no joint that moves; Arm needs at least one")
-        self.joint_names: tuple[str, ...] = tuple(joint.name for joint in moving)
-        self.joint_kinds: tuple[str, ...] = tuple(joint.kind for joint in moving)
-        self.num_joints = len(moving)
-        self._made_from = {"joints": (*moving, Joint(offset=tool)), "speed_limit": speed_limit, "form": form}
+        drivers, ratios, shifts = drivers_of(moving)
+        self.joint_names: tuple[str, ...] = tuple(joint.name for joint in drivers)
+        self.joint_kinds: tuple[str, ...] = tuple(joint.kind for joint in drivers)
+        self.full_turns = full_turns(moving, ratios)
+        self.num_joints = len(drivers)
+        self._made_from = {"joints": (*moving, Joint(offset=end)), "speed_limit": speed_limit, "form": form}
         limits = {
-            "lower": [joint.lower for joint in moving],
-            "upper": [joint.upper for joint in moving],
-            "speed_limit": [joint.speed_limit if speed_limit is None else speed_limit for joint in moving],
+            "lower": [joint.lower for joint in drivers],
+            "upper": [joint.upper for joint in drivers],
+            "speed_limit": _speed_limits(drivers, speed_limit),
         }
         for name, values in limits.items():
             self.register_buffer(name, torch.tensor(values, dtype=torch.float64), persistent=False)
-        self.form = FORMS[form](moving, tool)
-        self.components = ComponentForm(moving, tool)
+        self.form, self.components = FORMS[form](moving, end), ComponentForm(moving, end)
+        if any(joint.coupling is not None for joint in moving):
+            self.form = CoupledForm(self.form, ratios, shifts)
+            self.components = CoupledComponents(self.components, ratios, shifts)
         self.to(device=device, dtype=dtype)
 
     def part_settings(self) -> dict[str, Any]:
@@ -93,32 +122,65 @@ class Arm(Precise):
         return cls.from_urdf(ur5_urdf(tool_length), tip="tool", speed_limit=UR5_SPEED_LIMIT, dtype=dtype, device=device)
 
     @classmethod
-    def from_urdf(cls, text: str, *, tip: str, base: str | None = None, **options: Any) -> Arm:
-        """The arm from the link ``base`` (default: the root) to the link ``tip`` of URDF ``text``.
+    def from_urdf(cls, source: Source, *, tip: str, base: str | None = None, **options: Any) -> Arm:
+        """The arm from the link ``base`` (default: the root) to the link ``tip`` of URDF.
+
+        Nothing but the joints between the two is read, and joints that these mimic.
 
         Args:
-            text: the description.
+            source: the text, or the path of its file.
             tip: link whose frame is the tool's.
             base: link whose frame is the base frame.
-            options: of the constructor.
+            options: of the constructor; ``tool`` is a pose in the frame of the tip.
 
         Raises:
             InputError: the text cannot be read, a link is unknown, or a joint is of a kind that `Arm` cannot handle.
         """
-        return cls(joints_of_urdf(text, base=base, tip=tip), **options)
+        return cls(joints_of_urdf(source, base=base, tip=tip), **options)
 
     @classmethod
-    def from_mjcf(cls, text: str, *, tip: str, base: str | None = None, **options: Any) -> Arm:
-        """The arm from the body ``base`` (default: the world) to the body or site ``tip`` of MJCF ``text``.
+    def from_mjcf(cls, source: MjcfSource, *, tip: str, base: str | None = None, **options: Any) -> Arm:
+        """The arm from the body ``base`` (default: the world) to the body or site ``tip`` of MJCF.
 
-        MuJoCo itself, which the extra ``sim`` brings, reads the text. Arguments and errors are those of `from_urdf`.
+        MuJoCo itself, which the extra ``sim`` brings, reads the scene, in which anything else may be. Of a site and a
+        body that share a name, ``tip`` is the site; ``body:name`` and ``site:name`` say which. What has no name is
+        called by its index in the compiled model, as in ``joint#3``. Joints that an equality of two joints, or of
+        fixed tendons over two joints, holds together are one; the limits of tendons, and bodies that are welded or
+        connected, are left to MuJoCo. MJCF knows no speed limits.
+
+        Args:
+            source: the text, the path of its file (beside which MuJoCo finds meshes and included files), an `MjSpec` or
+                an `MjModel`.
+            tip: body or site whose frame is the tool's.
+            base: body whose frame is the base frame.
+            options: of the constructor; ``tool`` is a pose in the frame of the tip.
+
+        Raises:
+            InputError: as of `from_urdf`.
         """
-        return cls(joints_of_mjcf(text, base=base, tip=tip), **options)
+        return cls(joints_of_mjcf(source, base=base, tip=tip), **options)
 
     @classmethod
     def from_chain(cls, chain: pytorch_kinematics.SerialChain, **options: Any) -> Arm:
         """The arm of a chain that pytorch-kinematics has parsed, as precise as the chain (float32 by default)."""
         return cls(joints_of_chain(chain), **options)
+
+    def needed_speed_limit(self, owner: str) -> Tensor:
+        """``speed_limit``, for ``owner``, which cannot do without.
+
+        Raises:
+            InputError: a joint has none.
+        """
+        unlimited = [
+            name for name, speed in zip(self.joint_names, self.speed_limit.tolist(), strict=True) if speed == math.inf
+        ]
+        if unlimited:
+            names = ", ".join(map(repr, unlimited))
+            raise InputError(
+                f"{owner} needs the speed limits of all joints, and the description gives none for {names}: give the "
+                "arm a speed_limit=, one number for all joints or one for each [rad/s; m/s]"
+            )
+        return self.speed_limit
 
     def forward(self, joint_pos: Tensor) -> Tensor:
         """Pose of the tool, ``(*B, N)`` [rad; m] -> ``(*B, 4, 4)``, base frame [m]."""
@@ -136,7 +198,7 @@ class Arm(Precise):
         self.check(joint_pos)
         if joint_pos.ndim == 2:
             # A module's attribute that is a module takes as long to look up as a small operation.
-            form = cast(SineForm | TransformForm, self._modules["form"])
+            form = cast(SineForm | TransformForm | CoupledForm, self._modules["form"])
             return form.pose_and_jacobian(joint_pos)
         batch = joint_pos.shape[:-1]
         pose, jacobian = self.form.pose_and_jacobian(joint_pos.reshape(-1, self.num_joints))
@@ -151,3 +213,33 @@ class Arm(Precise):
         check_trailing_shape("joint_pos", joint_pos, self.num_joints)
         check_same_device("joint_pos", joint_pos, lower.device, "the arm")
         raise InputError(f"joint_pos is {joint_pos.dtype}, but the arm is {lower.dtype}: convert one of them")
+
+
+def _tool(pose: Tensor | Sequence[Sequence[float]]) -> Tensor:
+    """A tool's pose ``(4, 4)`` as float64, checked."""
+    try:
+        tool = torch.as_tensor(pose)
+        tool = tool.to("cpu", torch.float64)
+    except (TypeError, ValueError, RuntimeError) as error:
+        raise InputError(f"tool must be a pose (4, 4) of numbers, got {pose!r}") from error
+    if tool.shape != (4, 4):
+        raise InputError(f"tool must have shape (4, 4), got {tuple(tool.shape)}")
+    check_finite("tool", tool)
+    fixed = tool.detach()
+    off = fixed[:3, :3] @ fixed[:3, :3].T - torch.eye(3, dtype=torch.float64)
+    if off.abs().max() > 1e-5 or torch.linalg.det(fixed[:3, :3]) < 0.0 or fixed[3].tolist() != [0.0, 0.0, 0.0, 1.0]:
+        raise InputError(f"tool must be a rotation and a place, over a row of 0, 0, 0, 1, got {fixed.tolist()}")
+    return tool
+
+
+def _speed_limits(joints: Sequence[Joint], given: float | Sequence[float] | None) -> list[float]:
+    """The speed limit of each joint: its own, or the one that is given."""
+    if given is None:
+        return [joint.speed_limit for joint in joints]
+    values = [given] * len(joints) if isinstance(given, (int, float)) else list(given)
+    if len(values) != len(joints):
+        raise InputError(f"speed_limit must be one number or {len(joints)}, one for each joint, got {len(values)}")
+    limited = [replace(joint, speed_limit=float(value)) for joint, value in zip(joints, values, strict=True)]
+    for joint in limited:
+        check_limits(joint)
+    return [joint.speed_limit for joint in limited]

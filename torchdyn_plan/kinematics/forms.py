@@ -2,9 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
-from functools import cache
-from itertools import combinations, pairwise
+from collections.abc import Callable, Sequence
+from itertools import pairwise, repeat
 from typing import cast
 
 import torch
@@ -12,11 +11,23 @@ from torch import Tensor, nn
 
 from torchdyn_plan.errors import InputError
 from torchdyn_plan.kinematics.joint import Joint
-from torchdyn_plan.kinematics.trigonometric import NEGLIGIBLE, TrigonometricForm, trigonometric_form
+from torchdyn_plan.kinematics.trigonometric import (
+    MOST_COUNTABLE,
+    NEGLIGIBLE,
+    TrigonometricForm,
+    sine_counts,
+    trigonometric_form,
+)
 from torchdyn_plan.precision import Precise, autocast_is_on, without_autocast
 
 MOST_SINES = 128
 """More sines than this in one product cost more than a product of transforms."""
+MOST_TERMS = 2 * MOST_SINES + 1
+"""A series of more terms than this has more than `MOST_SINES` sines: one at least for each pair of frequencies ±k."""
+SINES_OF_A_JOINT = 9
+"""A long chain may have this many sines for each of its joints: three joints make a transform of 26."""
+LONGEST_PART = 12
+"""Joints that one transform is made of at most."""
 
 
 class SineForm(Precise):
@@ -142,41 +153,64 @@ def sine_form(joints: Sequence[Joint], tool: Tensor) -> SineForm:
 
 
 def transform_form(joints: Sequence[Joint], tool: Tensor) -> TransformForm:
-    """The chain as the product of the fewest transforms that have at most `MOST_SINES` sines in all."""
-    negligible = _negligible(joints, tool)
+    """The chain as the product of the fewest transforms that have, in all, at most `MOST_SINES` sines.
 
-    @cache
-    def form(start: int, stop: int) -> TrigonometricForm | None:
-        last = tool if stop == len(joints) else torch.eye(4, dtype=torch.float64)
-        try:
-            return trigonometric_form(joints[start:stop], last, negligible=negligible)
-        except InputError:
-            return None
-
-    best: list[TrigonometricForm] = []
-    for cuts in _cuts(len(joints)):
-        forms = [form(*cut) for cut in pairwise(cuts)]
-        kept = [one for one in forms if one is not None]
-        if len(kept) < len(forms):
-            continue
-        if best and len(kept) > len(best) and _sines(best) <= MOST_SINES:
-            break
-        if not best or _sines(kept) < _sines(best):
-            best = kept
-    return TransformForm(best)
+    A chain of more than 14 joints may have `SINES_OF_A_JOINT` for each.
+    """
+    negligible, most = _negligible(joints, tool), max(MOST_SINES, SINES_OF_A_JOINT * len(joints))
+    cuts = best_cuts(len(joints), _sines_of_parts(joints, tool, negligible), most)
+    parts = [
+        trigonometric_form(joints[start:stop], _behind(joints, stop, tool), negligible=negligible)
+        for start, stop in pairwise(cuts)
+    ]
+    return TransformForm(parts)
 
 
 def best_form(joints: Sequence[Joint], tool: Tensor) -> SineForm | TransformForm:
     """One product of sines where the chain has one of at most `MOST_SINES` sines, else a product of transforms."""
-    # The first joints alone tell of a chain whose whole expansion would be large.
-    for count in range(1, len(joints) + 1):
-        try:
-            form = trigonometric_form(joints[:count], tool, negligible=_negligible(joints, tool))
-        except InputError:
-            return transform_form(joints, tool)
-        if len(form.phases) > MOST_SINES:
-            return transform_form(joints, tool)
+    negligible = _negligible(joints, tool)
+    if len(joints) > MOST_COUNTABLE:
+        return transform_form(joints, tool)
+    try:
+        # The first joints alone tell of a chain whose whole expansion would be large.
+        for count in sine_counts(joints, repeat(tool), negligible=negligible, most=MOST_TERMS):
+            if count > MOST_SINES:
+                return transform_form(joints, tool)
+    except InputError:
+        return transform_form(joints, tool)
     return sine_form(joints, tool)
+
+
+def best_cuts(count: int, sines: dict[tuple[int, int], int], most: int) -> tuple[int, ...]:
+    """Where to cut a chain of ``count`` joints: into the fewest parts, at least two, with no more than ``most`` sines.
+
+    Of as many parts those with the fewest sines are taken, and of these the first in order; if all cuts have more than
+    ``most``, those with the fewest. By dynamic programming over the number of parts and the first joint of a tail.
+
+    Args:
+        count: joints.
+        sines: of each part that can be had, by its first joint and the one behind its last.
+        most: sines in all.
+
+    Returns:
+        First joints of all parts, and ``count``.
+    """
+    best: tuple[int, tuple[int, ...]] | None = None
+    tails: dict[int, tuple[int, tuple[int, ...]]] = {count: (0, (count,))}
+    for number in range(1, count + 1):
+        ways: dict[int, tuple[int, tuple[int, ...]]] = {}
+        for (start, stop), own in sines.items():
+            if stop in tails:
+                rest, cuts = tails[stop]
+                way = own + rest, (start, *cuts)
+                ways[start] = min(ways.get(start, way), way)
+        tails = ways
+        if 0 in tails and number >= min(2, count) and (best is None or tails[0][0] < best[0]):
+            best = tails[0]
+        if best is not None and best[0] <= most:
+            break
+    assert best is not None  # Each joint is a part of its own, at the least.
+    return best[1]
 
 
 FORMS: dict[str, Callable[[Sequence[Joint], Tensor], SineForm | TransformForm]] = {
@@ -194,15 +228,24 @@ def _slopes(form: TrigonometricForm) -> Tensor:
     return torch.zeros(len(form.frequencies), form.constant.numel(), dtype=torch.float64)
 
 
-def _cuts(count: int) -> Iterator[tuple[int, ...]]:
-    """Ways to cut a chain of ``count`` joints into neighbouring parts, the fewest parts first, at least two."""
-    for parts in range(min(2, count), count + 1):
-        for inner in combinations(range(1, count), parts - 1):
-            yield (0, *inner, count)
+def _sines_of_parts(joints: Sequence[Joint], tool: Tensor, negligible: float) -> dict[tuple[int, int], int]:
+    """Number of sines of each part of a chain whose series has at most `MOST_TERMS` terms."""
+    sines = {}
+    for start in range(len(joints)):
+        stops = range(start + 1, min(start + LONGEST_PART, len(joints)) + 1)
+        tools = (_behind(joints, stop, tool) for stop in stops)
+        counts = sine_counts(joints[start : stops[-1]], tools, negligible=negligible, most=MOST_TERMS)
+        try:
+            for stop, number in zip(stops, counts, strict=True):
+                sines[start, stop] = number
+        except InputError:
+            continue
+    return sines
 
 
-def _sines(forms: Sequence[TrigonometricForm]) -> int:
-    return sum(len(form.phases) for form in forms)
+def _behind(joints: Sequence[Joint], stop: int, tool: Tensor) -> Tensor:
+    """What comes behind the part of a chain that ends at joint ``stop``, before the next joint's own offset."""
+    return tool if stop == len(joints) else torch.eye(4, dtype=torch.float64)
 
 
 def _negligible(joints: Sequence[Joint], tool: Tensor) -> float:

@@ -4,11 +4,16 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
-from typing import Literal
+from dataclasses import dataclass, replace
+from typing import Literal, cast
 
 import torch
 from torch import Tensor
+
+from torchdyn_plan.checks import check_finite
+from torchdyn_plan.errors import InputError
+
+Kind = Literal["fixed", "revolute", "prismatic"]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -17,7 +22,7 @@ class Joint:
 
     offset: Tensor
     """``(4, 4)`` float64, from the previous frame to the joint's [m]. May require a gradient."""
-    kind: Literal["fixed", "revolute", "prismatic"] = "fixed"
+    kind: Kind = "fixed"
     axis: Tensor | None = None
     """``(3,)`` unit vector in the joint's own frame, along or about which it moves; None for a fixed joint."""
     name: str = ""
@@ -27,20 +32,73 @@ class Joint:
     """[rad; m]"""
     speed_limit: float = math.inf
     """[rad/s; m/s]"""
+    coupling: Coupling | None = None
+    """How another joint moves this one; None for a joint that moves on its own."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Coupling:
+    """That a joint is at ``ratio · q + shift``, with q the position of another joint, the driver."""
+
+    driver: Joint
+    """The other joint, in the chain or not. Its name says which it is; its limits hold, its offset does not matter."""
+    ratio: float = 1.0
+    shift: float = 0.0
+    """[rad; m]"""
 
 
 def merge_fixed(joints: Sequence[Joint]) -> tuple[list[Joint], Tensor]:
-    """The joints that move, fixed ones folded into the next one's offset, and the transform after the last of them."""
+    """The joints that move, fixed ones folded into the next one's offset, and the transform after the last of them.
+
+    Raises:
+        InputError: a joint's offset, axis or limits are not those of a joint.
+    """
     moving: list[Joint] = []
     offset = torch.eye(4, dtype=torch.float64)
     for joint in joints:
+        check_joint(joint)
         offset = offset @ joint.offset.to("cpu", torch.float64)
         if joint.axis is not None:
             axis = joint.axis.detach().to("cpu", torch.float64)
-            values = {"name": joint.name, "lower": joint.lower, "upper": joint.upper, "speed_limit": joint.speed_limit}
-            moving.append(Joint(offset=offset, kind=joint.kind, axis=axis / axis.norm(), **values))
+            moving.append(replace(joint, offset=offset, axis=axis / axis.norm()))
             offset = torch.eye(4, dtype=torch.float64)
     return moving, offset
+
+
+def check_joint(joint: Joint) -> None:
+    """Raise `InputError`, naming the joint, unless its numbers are those of a joint."""
+    named = f"joint {joint.name!r}"
+    if joint.offset.shape != (4, 4):
+        raise InputError(f"the offset of {named} must have shape (4, 4), got {tuple(joint.offset.shape)}")
+    check_finite(f"the offset of {named}", joint.offset)
+    if (joint.axis is None) != (joint.kind == "fixed"):
+        raise InputError(f"{named} is {joint.kind}, and its axis is {joint.axis}: only joints that move have one")
+    if joint.axis is not None:
+        length = float(joint.axis.detach().norm())
+        if not 0.0 < length < math.inf:
+            raise InputError(f"{named} has no axis: {joint.axis.tolist()}")
+        check_limits(joint)
+
+
+def check_limits(joint: Joint) -> None:
+    """Raise `InputError`, naming the joint, unless its limits leave it some position and some speed."""
+    if not joint.lower <= joint.upper:
+        raise InputError(f"joint {joint.name!r} has a lower limit of {joint.lower} and an upper one of {joint.upper}")
+    if not joint.speed_limit > 0.0:
+        raise InputError(f"joint {joint.name!r} has a speed limit of {joint.speed_limit}, which must be above 0")
+
+
+def motion(kind: Kind, axis: Tensor, position: float) -> Tensor:
+    """Transform ``(4, 4)`` float64 of a joint that moves, about or along the unit vector ``axis``, at ``position``."""
+    if kind == "prismatic":
+        return transform(position=position * axis)
+    return transform(rotation_about(axis, position))
+
+
+def held(joint: Joint, position: float) -> Joint:
+    """``joint`` as a fixed one, at ``position`` [rad; m]."""
+    where = motion(joint.kind, cast(Tensor, joint.axis), position)
+    return Joint(offset=joint.offset @ where, name=joint.name)
 
 
 def transform(rotation: Tensor | None = None, position: Sequence[float] | Tensor = (0.0, 0.0, 0.0)) -> Tensor:

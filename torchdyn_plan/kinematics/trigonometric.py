@@ -9,7 +9,7 @@ prismatic joint after a revolute one multiplies sines by q and has no such form.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from typing import NamedTuple
 
@@ -20,6 +20,10 @@ from torchdyn_plan.errors import InputError
 from torchdyn_plan.kinematics.joint import Joint, cross_matrix
 
 NEGLIGIBLE = 1e-12
+MOST_TERMS = 3**8
+"""Terms that a chain is expanded to at most: all those of eight revolute joints."""
+MOST_COUNTABLE = 40
+"""Joints whose frequencies are different integers of 64 bits."""
 
 
 class Series(NamedTuple):
@@ -50,16 +54,24 @@ class TrigonometricForm:
     """``(N, 3, 4 + 2N)``: what prismatic joints add; None where there are none."""
 
 
-def trigonometric_form(joints: Sequence[Joint], tool: Tensor, *, negligible: float = NEGLIGIBLE) -> TrigonometricForm:
-    """Expand a chain exactly.
+class Expansion(NamedTuple):
+    """The first joints of a chain, expanded; without the transform that comes after them."""
 
-    Args:
-        joints: those that move, base to tip.
-        tool: ``(4, 4)``, from the last joint's frame to the tool.
-        negligible: terms smaller than this [m, or as entries of a rotation] are rounding and dropped.
+    pose: Series
+    """``(M, 4, 4)``"""
+    axes: list[Series]
+    """``(M, 3)`` for each joint, in the base frame; empty for a prismatic one."""
+    slopes: Tensor
+    """As of `TrigonometricForm`."""
+
+
+def expansions(joints: Sequence[Joint], *, negligible: float, most: int) -> Iterator[Expansion]:
+    """The first joint of a chain, the first two, and so on, each of them exactly.
+
+    A chain's series never gets shorter by another joint, so that the first one that is too long is where to stop.
 
     Raises:
-        InputError: a prismatic joint follows a revolute one.
+        InputError: a prismatic joint follows a revolute one, or a series has more than ``most`` terms.
     """
     count = len(joints)
     pose = Series(torch.zeros(1, count, dtype=torch.float64), torch.eye(4, dtype=torch.complex128).unsqueeze(0))
@@ -77,9 +89,68 @@ def trigonometric_form(joints: Sequence[Joint], tool: Tensor, *, negligible: flo
         else:
             axes.append(axis)
             pose = _turned(pose, joint.axis, index, negligible)
+        if len(pose.coefficients) > most:
+            raise InputError(
+                f"the chain has more than {most} terms up to joint {joint.name!r}: too many for one product of sines"
+            )
+        yield Expansion(pose, list(axes), slopes)
+
+
+def trigonometric_form(
+    joints: Sequence[Joint], tool: Tensor, *, negligible: float = NEGLIGIBLE, most: int = MOST_TERMS
+) -> TrigonometricForm:
+    """Expand a chain exactly.
+
+    Args:
+        joints: those that move, base to tip.
+        tool: ``(4, 4)``, from the last joint's frame to the tool.
+        negligible: terms smaller than this [m, or as entries of a rotation] are rounding and dropped.
+        most: terms that the series may have.
+
+    Raises:
+        InputError: a prismatic joint follows a revolute one, or there are more terms.
+    """
+    *_, (pose, axes, slopes) = expansions(joints, negligible=negligible, most=most)
     pose = Series(pose.frequencies, pose.coefficients @ tool.to(torch.complex128))
     entries = _entries(pose, axes, slopes)
     return _real_form(entries, negligible, slopes if bool(slopes.any()) else None)
+
+
+def sine_counts(joints: Sequence[Joint], tools: Iterable[Tensor], *, negligible: float, most: int) -> Iterator[int]:
+    """How many sines the `trigonometric_form` has of the first joint of a chain, of the first two, and so on.
+
+    Counting takes a fraction of the time of the forms. A frequency has a cosine where any of its entries has a real
+    part, and a sine where any has an imaginary one; to derive the place by joints exchanges the two.
+
+    Args:
+        joints: those that move, base to tip; at most `MOST_COUNTABLE`.
+        tools: ``(4, 4)``, what is behind the first joint, behind the second, and so on.
+        negligible: as of `trigonometric_form`.
+        most: as of `trigonometric_form`.
+
+    Raises:
+        InputError: as of `expansions`.
+    """
+    # Each joint adds -1, 0 or 1: frequencies are numbers to the base 3.
+    digits = 3 ** torch.arange(len(joints))
+    turning: list[Tensor] = []
+    for (series, axes, _), tool in zip(expansions(joints, negligible=negligible, most=most), tools, strict=False):
+        turning.append(_codes(axes[-1].frequencies, digits, _parts_of(axes[-1].coefficients, negligible)))
+        pose = series.coefficients[:, :3] @ tool.to(torch.complex128)
+        posed, placed = _parts_of(pose.flatten(1), negligible), _parts_of(pose[:, :, 3], negligible)
+        codes = _codes(series.frequencies, digits, posed | placed.flip(-1))
+        yield len(torch.unique(torch.cat([codes, *turning])))
+
+
+def _parts_of(coefficients: Tensor, negligible: float) -> Tensor:
+    """Whether terms ``(M, K)`` have a real and an imaginary part in any entry, ``(M, 2)``."""
+    return 2.0 * torch.view_as_real(coefficients.detach()).abs().amax(dim=1) > negligible
+
+
+def _codes(frequencies: Tensor, digits: Tensor, parts: Tensor) -> Tensor:
+    """One integer for each part that frequencies ``(M, N)`` have: k for real and -k for imaginary ones, of ±k once."""
+    keys = (frequencies.long() * digits).sum(dim=1)
+    return torch.stack([keys, -keys], dim=-1)[parts & (keys > 0).unsqueeze(-1)]
 
 
 def _turned(pose: Series, axis: Tensor, index: int, negligible: float) -> Series:
@@ -119,7 +190,8 @@ def _entries(pose: Series, axes: Sequence[Series], slopes: Tensor) -> Series:
 def _real_form(entries: Series, negligible: float, slopes: Tensor | None) -> TrigonometricForm:
     """Pair ±k into real sines: c·e^{ikq} + conj = 2 Re(c) cos(kq) - 2 Im(c) sin(kq)."""
     # The sign of a vector's first entry that is not zero.
-    sign = (entries.frequencies.sign() * 2.0 ** -torch.arange(entries.frequencies.shape[1])).sum(dim=1)
+    first = (entries.frequencies != 0.0).to(torch.uint8).argmax(dim=1, keepdim=True)
+    sign = entries.frequencies.gather(1, first).squeeze(1)
     frequencies, rows = entries.frequencies[sign > 0], entries.coefficients[sign > 0]
     weights = torch.cat([2.0 * rows.real, -2.0 * rows.imag])
     phases = torch.zeros(len(weights), dtype=torch.float64)
