@@ -55,9 +55,19 @@ def plain_step(joint_pos, goal):
     pose, jacobian = ARM.pose_and_jacobian(joint_pos)
     way = plain_way(pose[..., :3, 3], target - BASE, on_table)
     error = torch.cat([way, upright_error(pose[..., :3, :3])], dim=-1)
-    step = limited_step(dls_step(jacobian, error, 0.02), LIMIT, 0.25)
-    step = torch.clamp(step, ARM.lower - joint_pos, ARM.upper - joint_pos)
+    step = torch.stack([one_step(*row) for row in zip(joint_pos, jacobian, error, strict=True)])
     return (step / LIMIT).clamp(-1.0, 1.0), joint_pos + step
+
+
+def one_step(joint_pos, jacobian, error):
+    """A row's step: of the joints that may move, and solved anew, twice at most, without those that may not."""
+    free = list(range(6))
+    for _ in range(3):
+        whole = torch.zeros(6, dtype=torch.float64)
+        whole[free] = dls_step(jacobian[:, free], error, 0.02)
+        low, high = ARM.lower - joint_pos, ARM.upper - joint_pos
+        free = [i for i in free if not ((low[i] >= 0 and whole[i] < 0) or (high[i] <= 0 and whole[i] > 0))]
+    return torch.clamp(limited_step(whole, LIMIT, 0.25), low, high)
 
 
 def situations(count=2000):
