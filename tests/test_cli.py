@@ -503,3 +503,18 @@ def test_a_closed_pipe_does_not_end_a_benchmark(monkeypatch):
         say("one")
         say("two")
         monkeypatch.undo()
+
+
+@pytest.mark.usefixtures("quick")
+def test_what_cannot_be_saved_is_told_at_least(tmp_path, monkeypatch, capsys):
+    def full(*_):
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr(os, "fsync", full)
+    words = ["evaluate", "--planners", "pursuit", "--episodes", 2, "--threads", 1, "--out", tmp_path / "new"]
+    code, out, err = answer(words, capsys)
+    assert code == 2
+    assert "pursuit" in out
+    assert err.splitlines()[-1].startswith("torchdyn-plan: error: cannot write ")
+    assert err.splitlines()[-1].endswith("episodes.json': No space left on device")
+    assert not (tmp_path / "new").exists()

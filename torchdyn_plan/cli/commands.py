@@ -25,7 +25,7 @@ from torchdyn_plan.cli.arguments import (
     default_folder,
 )
 from torchdyn_plan.cli.output import say
-from torchdyn_plan.errors import InputError
+from torchdyn_plan.errors import InputError, OutputError
 from torchdyn_plan.tasks import Task
 
 if TYPE_CHECKING:
@@ -61,7 +61,12 @@ def evaluate(task: Task, arguments: EvaluateArguments) -> None:
     from torchdyn_plan.evaluation import evaluate
 
     task.default_settings(**asdict(arguments.settings))
-    found = evaluate(task, arguments.planners, out=arguments.out, **_shared(task, arguments))
+    try:
+        found = evaluate(task, arguments.planners, out=arguments.out, **_shared(task, arguments))
+    except OutputError as error:
+        for note in getattr(error, "__notes__", ()):
+            say(note)
+        raise
     say(found.table())
     if arguments.out is not None:
         say(f"\nwritten: {', '.join(str(path) for path in sorted(arguments.out.iterdir()))}")

@@ -4,13 +4,18 @@ import io
 import os
 import sys
 
+from torchdyn_plan.errors import OutputError
+
 
 def say(text: str) -> None:
-    """Print ``text`` at once; from when nobody reads on, to nowhere."""
+    """Print ``text`` at once; from when nobody reads on, to nowhere. Raises `OutputError` if it cannot be written."""
     try:
         print(text, flush=True)
     except BrokenPipeError:
         silence()
+    except OSError as error:
+        silence()
+        raise OutputError(f"cannot print: {error.strerror or error}") from error
 
 
 def silence() -> None:

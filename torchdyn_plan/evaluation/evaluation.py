@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from torchdyn_plan.checks import check_seed
+from torchdyn_plan.errors import OutputError
 from torchdyn_plan.evaluation.identity import check_evaluation_folder, clear_results
 from torchdyn_plan.evaluation.plots import plot_results
 from torchdyn_plan.evaluation.report import format_table
@@ -122,5 +123,10 @@ def evaluate(
     outcomes = study.run(chosen, seed)
     found = Evaluation(task=task, rows=study.summarize(chosen, outcomes), outcomes=outcomes, config=config)
     if out is not None:
-        found.save(out, overwrite=overwrite)
+        try:
+            found.save(out, overwrite=overwrite)
+        except OutputError as error:
+            # What cannot be saved is told at least.
+            error.add_note(found.table())
+            raise
     return found
