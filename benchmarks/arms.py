@@ -1,4 +1,4 @@
-"""Arms for the studies of inverse kinematics: real ones from their tables, bases under them, narrow limits, random chains."""
+"""Arms for studies of inverse kinematics: real ones by their tables, on bases, with narrow limits, random chains."""
 
 from __future__ import annotations
 
@@ -32,7 +32,9 @@ def joint(
     return Joint(offset=transform(yaw @ pitch @ roll, xyz), kind=kind, **moving, **values)  # type: ignore[arg-type]
 
 
-def universal(d1: float, a2: float, a3: float, d4: float, d5: float, d6: float, turn: float = 2 * math.pi) -> list[Joint]:
+def universal(  # noqa: PLR0917  # The table's own columns.
+    d1: float, a2: float, a3: float, d4: float, d5: float, d6: float, turn: float = 2 * math.pi
+) -> list[Joint]:
     """A UR arm by its table."""
     full, elbow = (-turn, turn), (-min(turn, math.pi), min(turn, math.pi))
     return [

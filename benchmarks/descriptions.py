@@ -274,9 +274,9 @@ def is_installed(package: str) -> bool:
 
 
 def is_scene(file: Path) -> bool:
-    """Whether a file is MJCF with bodies in it, and no part of another one."""
+    """Whether a file is MJCF on its own, and not what others include."""
     text = file.read_text(errors="replace")
-    return "<mujoco" in text and "<body" in text and "joint" in text
+    return re.search(r"<mujoco[\s>]", text) is not None and "<worldbody" in text
 
 
 def unreadable(source: Any, read: Callable[..., Arm], reason: Exception) -> Row:

@@ -162,13 +162,6 @@ def test_a_joint_of_another_kind_is_refused(kind):
         Arm.from_urdf(urdf(kind), tip="b")
 
 
-def test_a_joint_that_mimics_another_is_refused():
-    with pytest.raises(InputError, match="joint 'slide' mimics another"):
-        Arm.from_urdf(
-            urdf("revolute", '<limit lower="-1" upper="1" effort="1" velocity="1"/><mimic joint="o"/>'), tip="b"
-        )
-
-
 def test_a_ball_joint_of_mjcf_is_refused():
     text = '<mujoco><worldbody><body name="b"><joint type="ball"/><geom size="1"/></body></worldbody></mujoco>'
     with pytest.raises(InputError, match=r"the MJCF text has a joint of type .*; Arm handles fixed, revolute"):

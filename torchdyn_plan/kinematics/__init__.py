@@ -6,7 +6,7 @@ from torchdyn_plan.kinematics.cartesian import ArmSolver
 from torchdyn_plan.kinematics.dls import dls_step, limited_step, square_turn, upright_error
 from torchdyn_plan.kinematics.follow import follow
 from torchdyn_plan.kinematics.fused import compiled_pose_and_jacobian
-from torchdyn_plan.kinematics.joint import Joint
+from torchdyn_plan.kinematics.joint import Coupling, Joint
 from torchdyn_plan.kinematics.solver import IKResult, IKStatus, solve_ik
 from torchdyn_plan.kinematics.targets import constraint_error, constraint_jacobian, rotation_vector
 from torchdyn_plan.kinematics.ur5 import UR5_LINKS, UR5_SPEED_LIMIT, ur5_urdf
@@ -17,6 +17,7 @@ __all__ = [
     "Arm",
     "ArmSolver",
     "Branches",
+    "Coupling",
     "IKResult",
     "IKStatus",
     "Joint",

@@ -95,7 +95,7 @@ def universal(arm: Arm) -> Universal | str:
     return _KNOWN[arm]
 
 
-def all_branches(
+def all_branches(  # noqa: PLR0917  # All are needed.
     form: Universal, arm: Arm, target: Tensor, start: Tensor, lower: Tensor, upper: Tensor
 ) -> tuple[Tensor, Tensor]:
     """Solutions ``(M, 8, 6)`` of ``target`` (M, 4, 4) near ``start`` (M, 6), and which are valid, ``(M, 8)``."""
@@ -126,7 +126,7 @@ def _angles(form: Universal, target: Tensor, last: Tensor) -> tuple[Tensor, Tens
     """
     upper_arm, forearm, shoulder, wrist = form.lengths
     eps = torch.finfo(target.dtype).eps
-    (x1, y1, z1, px), (x2, y2, z2, py), (x3, y3, z3, pz) = _entries(form, target)
+    (x1, y1, z1, px), (x2, y2, z2, py), (x3, y3, _, pz) = _entries(form, target)
     sides = target.new_tensor([1.0, -1.0]).unsqueeze(-1)
 
     # The wrist's centre lies d₄ aside of the plane in which the arm bends: s₁ px - c₁ py = d₄.

@@ -122,7 +122,7 @@ class ArmSolver(Precise):
         return q[:, 0], status[:, 0], residual[:, 0]
 
     def _targets(self, pose: Tensor, mask: Tensor | None) -> tuple[Tensor, Tensor | None]:
-        """Poses ``(M, 4, 4)`` in the arm's base frame and weights ``(M, 6, 6)`` of their errors; None where all are 1."""
+        """Poses ``(M, 4, 4)`` in the arm's base frame, weights ``(M, 6, 6)`` of their errors; None where all are 1."""
         turned = pose[:, 3:].square().sum(dim=-1).sqrt()
         oriented = turned.isfinite() & (turned > 1e-6)
         eye = torch.eye(4, dtype=pose.dtype, device=pose.device).repeat(len(pose), 1, 1)

@@ -61,7 +61,7 @@ def limited_step(step: Tensor, limit: Tensor, gain: float) -> Tensor:
     return step * torch.clamp(1.0 / worst.clamp_min(1e-12), max=gain)
 
 
-def dls_step_within(
+def dls_step_within(  # noqa: PLR0917  # As of `dls_step`, and the limits.
     jacobian: Tensor,
     error: Tensor,
     damping: Tensor,

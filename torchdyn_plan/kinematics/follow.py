@@ -13,7 +13,7 @@ from torchdyn_plan.errors import InputError
 from torchdyn_plan.kinematics.arm import Arm
 from torchdyn_plan.kinematics.descent import Search, descend, evaluate, residual_at
 from torchdyn_plan.kinematics.nearest import speeds
-from torchdyn_plan.kinematics.solver import IKResult, IKStatus, inside_limits, reason, solve_rows
+from torchdyn_plan.kinematics.solver import IKResult, IKStatus, inside_limits, solve_rows
 from torchdyn_plan.kinematics.targets import CONSTRAINTS, as_pose, as_rows, is_pose
 from torchdyn_plan.precision import without_autocast
 
@@ -101,9 +101,7 @@ def follow(
     return IKResult(q.view(*batch, steps, arm.num_joints), status.view(*batch, steps), residual.view(*batch, steps, 2))
 
 
-def following(
-    arm: Arm, constraint: str, symmetry: int, tolerances: tuple[float, float], iterations: int
-) -> Search:
+def following(arm: Arm, constraint: str, symmetry: int, tolerances: tuple[float, float], iterations: int) -> Search:
     """A search of poses that are yet to come."""
     speed, none = speeds(arm), arm.lower.new_zeros(0, 4, 4)
     step = torch.ones_like(speed)
@@ -120,7 +118,8 @@ def follow_rows(
     q, residual = start.new_empty(count, steps, joints), start.new_empty(count, steps, 2)
     status = torch.empty(count, steps, dtype=torch.int64, device=start.device)
     good = start.isfinite().all(dim=-1)
-    inside = torch.where(good.unsqueeze(-1), torch.clamp(start, search.arm.lower, search.arm.upper), _finite(search.arm))
+    clamped = torch.clamp(start, search.arm.lower, search.arm.upper)
+    inside = torch.where(good.unsqueeze(-1), clamped, _finite(search.arm))
     outside = good & (inside != start).any(dim=-1)
     late = torch.zeros(count, dtype=torch.int64, device=start.device)
     state = _State(start, inside, outside, late, evaluate(search.arm, inside)[0])
@@ -132,7 +131,7 @@ def follow_rows(
     return q, status, residual
 
 
-def _advance(
+def _advance(  # noqa: PLR0917  # One step of a loop over all of them.
     search: Search, state: _State, target: Tensor, valid: Tensor, reach: Tensor, patience: int
 ) -> _State:
     """The state one step of time later."""
@@ -160,7 +159,7 @@ def _tight(search: Search) -> Search:
 
 
 def _follow_on(search: Search, q: Tensor, rows: Tensor, reach: Tensor) -> tuple[Tensor, Tensor]:
-    """The nearest to the target that can be reached from ``q`` (A, N) in one step, and whether it is there, ``(A,)``."""
+    """The nearest to the target that one step from ``q`` (A, N) reaches, and whether it is there, ``(A,)``."""
     most = _within(q, reach)
     lower, upper = torch.maximum(search.arm.lower, q - most), torch.minimum(search.arm.upper, q + most)
     part = _rows_of(search, rows)._replace(lower=lower, upper=upper)

@@ -1,4 +1,4 @@
-"""Which of several joint positions is the nearest to a start: whole turns taken off, and the time that the way takes."""
+"""Which of several joint positions is the nearest to a start: whole turns off, and the time that the way takes."""
 
 from __future__ import annotations
 

@@ -158,7 +158,7 @@ def _text(joints: Iterable[Element]) -> bytes:
     for joint in joints:
         copy = Element("joint", name=_name(joint), type=joint.get("type", ""))
         copy.extend(Element(end, link=_end(joint, end)) for end in ("parent", "child"))
-        copy.extend(_parts(joint))
+        copy.extend(list(_parts(joint)))
         root.append(copy)
     return ElementTree.tostring(root)
 

@@ -228,7 +228,8 @@ class IKPlanner(Precise, StaticPlannerModule):
         share = (1.0 / worst.clamp_min(1e-12)).clamp(max=self.gain)
         bounds = zip(joint_pos, lower, upper, strict=True)
         ways = [(low - here, high - here) for here, low, high in bounds]
-        out = [((low >= 0.0) & (value < 0.0)) | ((high <= 0.0) & (value > 0.0)) for value, (low, high) in zip(step, ways, strict=True)]
+        pairs = zip(step, ways, strict=True)
+        out = [((low >= 0.0) & (value < 0.0)) | ((high <= 0.0) & (value > 0.0)) for value, (low, high) in pairs]
         pushed = functools.reduce(torch.logical_or, out).to(goal[0].dtype)
         step = [torch.clamp(value * share, *way) for value, way in zip(step, ways, strict=True)]
         action = [(value / most).clamp(-1.0, 1.0) for value, most in zip(step, limit, strict=True)]
