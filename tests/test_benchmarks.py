@@ -28,10 +28,18 @@ SMALL = {
     "schedules": "--planners wait_and_drop --velocities 3 --schedules paper --episodes 4",
     "static_task": "--episodes 8 --split dev",
 }
-ELSEWHERE = {"killed_training", "measure_arrivals", "policy_curves", "policy_peers", "same_episodes"}
-"""Minutes at the least, a picture of trainings, what the package's own arrival map is made by, or a comparison of
+ELSEWHERE = {
+    "descriptions",
+    "inverse",
+    "killed_training",
+    "measure_arrivals",
+    "policy_curves",
+    "policy_peers",
+    "same_episodes",
+}
+"""Minutes at the least, files of other packages, a picture of trainings, what the package's own arrival map is made by, or a comparison of
 files."""
-PARTS = {"former_latency_side", "study"}
+PARTS = {"arms", "former_latency_side", "study"}
 """No scripts of their own."""
 
 
