@@ -37,8 +37,8 @@ ELSEWHERE = {
     "policy_peers",
     "same_episodes",
 }
-"""Minutes at the least, files of other packages, a picture of trainings, what the package's own arrival map is made by, or a comparison of
-files."""
+"""Minutes at the least, files of other packages, a picture of trainings, what the package's own arrival map is made by,
+or a comparison of files."""
 PARTS = {"arms", "former_latency_side", "study"}
 """No scripts of their own."""
 
