@@ -126,6 +126,8 @@ def test_general_modules_know_no_task(file):
 def test_planners_and_below_know_no_simulation(part):
     for file in files_of(part):
         used = {name.split(".")[0] for name in imports(without_primer(ast.parse(file.read_text())))}
+        # MuJoCo itself reads MJCF: for type checkers, and inside the function that asks for it.
+        used -= {"mujoco"} if file == ROOT / "kinematics" / "mjcf.py" else set()
         assert not used & SIMULATION, f"{file.relative_to(ROOT)} imports {used & SIMULATION}"
 
 

@@ -335,7 +335,7 @@ def test_planners_stay_as_they_were():
     ("given", "message"),
     [
         ({"device": "gpu"}, "device 'gpu' cannot be used"),
-        ({"device": "meta"}, "unknown kind of device to measure on 'meta'"),
+        ({"device": "meta"}, "device 'meta' cannot be used"),
         ({"batches": ()}, "batches must name one number of rows at least"),
         ({"batches": (1, 0)}, "batches must be >= 1, got 0"),
         ({"seconds": -1.0}, "seconds must be >= 0"),
