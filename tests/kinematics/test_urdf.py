@@ -285,6 +285,21 @@ def test_a_coupled_arm_does_all_that_an_arm_does():
     assert bool(path.isfinite().all())
 
 
+def test_a_driver_is_not_turned_on_where_it_moves_others_by_parts_of_a_turn():
+    axes = torch.tensor([[0.0, 0, 1], [0, 1, 0], [0, 1, 0]], **DOUBLE)
+    places = [transform(position=(0.3, 0, 0)) for _ in range(4)]
+    driver, last = (Joint(name=f"j{i}", offset=places[i], kind="revolute", axis=axes[i]) for i in (0, 2))
+    follower = Joint(offset=places[1], kind="revolute", axis=axes[1], coupling=Coupling(driver=driver, ratio=0.5))
+    arm = Arm([driver, follower, last, Joint(offset=places[3])], **DOUBLE)
+    q = configurations(50, 2)
+    start = q + torch.tensor([2.0 * math.pi, 0.0], **DOUBLE)
+    result = solve_ik(arm, arm(q), q0=start, constraint="position")
+    off = (arm(result.q) - arm(q))[..., :3, 3].norm(dim=-1)
+    solved = result.status == 0
+    assert int(solved.sum()) > 40
+    assert float(off[solved].max()) <= 1e-3
+
+
 @pytest.mark.slow
 def test_a_coupled_arm_is_compiled():
     arm = Arm.from_urdf(finger(), tip="e", **DOUBLE)

@@ -15,8 +15,8 @@ DISTINCT = 0.01
 
 
 def revolute(arm: Arm) -> Tensor:
-    """Which joints turn, ``(N,)`` bool."""
-    return torch.tensor([kind == "revolute" for kind in arm.joint_kinds], device=arm.lower.device)
+    """Which joints turn, and are where they were after a full turn with all that they move, ``(N,)`` bool."""
+    return torch.tensor(arm.full_turns, device=arm.lower.device)
 
 
 def reduced(arm: Arm, q: Tensor) -> Tensor:
