@@ -4,13 +4,16 @@ python tools/ship_planners.py
 """
 
 # ruff: noqa: T201
+from collections.abc import Iterator
+from functools import partial
 from pathlib import Path
 from typing import Any
 
 from torchdyn_plan.files import write_json
+from torchdyn_plan.nets import ETANetwork
 from torchdyn_plan.nets.pretrained import SHIPPED, Pretrained
 from torchdyn_plan.planners.pretrained import describe_planner
-from torchdyn_plan.tasks import load_task
+from torchdyn_plan.tasks import Task, load_task
 
 NAMES = {"corner": "", "wait_and_drop": "-wait_and_drop"}
 """Planners that ship, and what follows task and static planner in their names."""
@@ -19,19 +22,27 @@ NAMES = {"corner": "", "wait_and_drop": "-wait_and_drop"}
 def shipped_planners() -> dict[str, dict[str, Any]]:
     """Name of each planner that ships, and its description."""
     found = {}
-    for task in map(load_task, ("trapper", "fetch_reach")):
+    for task in tasks():
         for static in task.static_planners:
-            # Weights are shared: a network's file is named after its task, and after the static planner if it is the
-            # static planner's.
-            files = {"eta": f"{task.name}-{static}", "forecaster": task.name, "spread": task.name, "policy": task.name}
-
-            def file_of(network: Pretrained, files: dict[str, str] = files) -> str:
-                return f"{network.kind}-{files[network.kind]}.safetensors"
-
             for planner, ending in NAMES.items():
                 if planner in task.planners:
-                    found[f"{task.name}-{static}{ending}"] = describe_planner(task.planner(planner, static), file_of)
+                    name = f"{task.weights_name}-{static}"
+                    file_of = partial(weights_file, task.weights_name, name)
+                    found[f"{name}{ending}"] = describe_planner(task.planner(planner, static), file_of)
     return found
+
+
+def tasks() -> Iterator[Task]:
+    """Those whose planners ship, in each of their scenes."""
+    for task in map(load_task, ("trapper", "fetch_reach")):
+        yield from [task.in_scene(scene) for scene in task.scenes] or [task]
+
+
+def weights_file(shared: str, own: str, network: Pretrained) -> str:
+    """File of ``network``, called after its task, or after the static planner, too, if it is the static planner's."""
+    if not isinstance(network, ETANetwork):
+        return f"{network.kind}-{shared}.safetensors"
+    return f"{network.kind}-{own}{'' if network.config.never else '-nearest'}.safetensors"
 
 
 def main(folder: Path = SHIPPED) -> None:

@@ -12,6 +12,7 @@ TARGET_POS = "target_pos"
 TARGET_HISTORY = "target_history"
 HISTORY_LENGTH = "history_length"
 TARGET_FUTURE = "target_future"
+TRUE_FUTURE = "true_future"
 ROBOT_STATE = "robot_state"
 OBSERVATION = "observation"
 ACHIEVED_GOAL = "achieved_goal"
@@ -22,6 +23,8 @@ ARRIVAL_STEPS = "arrival_steps"
 ACTION = "action"
 EPISODE = "episode"
 PLAN = "plan"
+TRUTHS = frozenset((TARGET_FUTURE, TRUE_FUTURE))
+"""What no planner can know outside of an evaluation."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -51,7 +54,8 @@ KEYS: tuple[Key, ...] = (
     Key(name=GOAL, shape=(3,), meaning="place the static planner is sent to [m, world]", writer="planner"),
     Key(name=ARRIVAL_STEPS, shape=(), meaning="control steps from now to the meeting", writer="planner"),
     Key(name=ACTION, shape=("A",), meaning="what the robot is told to do, each entry -1 to 1", writer="static planner"),
-    Key(name=TARGET_FUTURE, shape=("F", 3), meaning="recorded truth, for the oracle [m, world]", writer="evaluation"),
+    Key(name=TARGET_FUTURE, shape=("F", 3), meaning="recorded truth, from step 0 on [m, world]", writer="evaluation"),
+    Key(name=TRUE_FUTURE, shape=("F", 3), meaning="the truth from the next step on [m, world]", writer="evaluation"),
     Key(name=PLAN, shape=(), meaning="the planner's memory between steps (nested)", writer="planner"),
 )
 """Every shared key. Further entries below ``plan`` belong to the planner that wrote them."""

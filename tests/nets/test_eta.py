@@ -131,3 +131,29 @@ def test_wrong_inputs_are_named(network):
         network.arrival(state, goal, estimator="expectaton")
     with pytest.raises(InputError, match=r"tool_slice.*\(13, 16\)"):
         ETAConfig(tool_slice=(13, 16))
+
+
+def test_a_network_without_never_gives_it_no_chance_in_any_form(tmp_path):
+    torch.manual_seed(0)
+    network = ETANetwork(hidden=16, never=False).double().eval()
+    state, goal = samples(50)
+    logits = network(state, goal)
+    assert network.head.out_features == 100
+    assert logits.shape == (50, 101)
+    assert bool((logits[:, -1] == -torch.inf).all())
+    torch.testing.assert_close(network.for_inference()(state, goal), logits)
+    for estimator in ("mode", "expectation", "distribution", "soft"):
+        arrival = network.arrival(state, goal, estimator=estimator)
+        assert bool(arrival.steps.isfinite().all())
+        assert not arrival.never.any()
+    goal.requires_grad_()
+    network.arrival(state, goal, estimator="soft").steps.sum().backward()
+    assert bool(goal.grad.isfinite().all())
+    restored = ETANetwork.from_pretrained(network.save_pretrained(tmp_path))
+    assert restored.config.never is False
+    torch.testing.assert_close(restored(state.float(), goal.detach().float()), logits.float(), atol=1e-5, rtol=0)
+
+
+def test_whether_there_is_never_is_a_yes_or_a_no():
+    with pytest.raises(InputError, match="never must be True or False, got 1"):
+        ETAConfig(never=1)

@@ -53,7 +53,7 @@ def write_arrivals(folder, *, runs=40, digest=None):
     distance = (goal - state[:, 12:]).norm(dim=-1)
     arrival = torch.where(distance > 0.9, -1, (distance / 0.01).round().long())
     run = torch.arange(runs).repeat_interleave(5)
-    tensors = {"robot_state": state, "goal": goal, "arrival": arrival, "run": run}
+    tensors = {"robot_state": state, "goal": goal, "arrival": arrival, "nearest": arrival.clamp_min(0), "run": run}
     save_file(tensors, folder / "arrivals-0-000.safetensors", made(12, digest) | {"static": "ik"})
     describe(folder, "arrivals", digest)
     return tensors

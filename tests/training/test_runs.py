@@ -4,7 +4,7 @@ import pytest
 import torch
 
 from torchdyn_plan.errors import InputError
-from torchdyn_plan.training.runs import RunPlan, record_runs
+from torchdyn_plan.training.runs import STATES_PER_RUN, RunPlan, first_as_near, record_runs
 
 SIZE = 4
 
@@ -18,6 +18,11 @@ class Swinging:
     @property
     def robot_state(self) -> torch.Tensor:
         return torch.ones(self.count, SIZE)
+
+    @property
+    def tool_pos(self) -> torch.Tensor:
+        """Comes 0.1 m a step nearer to its goals, and rests before them from step 4 on."""
+        return torch.stack([(1.0 - 0.1 * self.steps).clamp(min=0.6), *torch.zeros(2, self.count)], dim=-1)
 
     def reset(self) -> None:
         self.steps[:] = 0
@@ -74,3 +79,24 @@ def test_sequences_follow_one_another_with_draws_of_their_own() -> None:
 def test_a_run_that_is_longer_than_its_sequence_is_refused() -> None:
     with pytest.raises(InputError, match="longest"):
         RunPlan(goals=lambda count, draw: torch.zeros(count, 3), sequence=10, longest=11, redirected_within=5)
+
+
+def test_a_goal_out_of_reach_is_timed_to_when_the_tool_is_as_near_as_it_comes() -> None:
+    found = runs(comes_to_rest=False)
+    arrived = found["arrival"] >= 0
+    assert torch.equal(found["nearest"][arrived], found["arrival"][arrived])
+    # The first sample of a run is at its start; the toy's counter, and so its tool, is one run behind at later ones.
+    first = torch.arange(len(arrived)) % STATES_PER_RUN == 0
+    assert set(found["nearest"][~arrived & first].tolist()) <= {0, 4}
+    assert (found["nearest"][~arrived & first] == 4).any()
+    assert (found["nearest"][~arrived & ~first] < 4).any()
+
+
+def test_the_nearest_place_counts_and_not_the_distance() -> None:
+    # A tool that descends a decimetre beside a goal a metre off comes hardly nearer to it by that.
+    height = torch.tensor([0.1, 0.1, 0.06, 0.0, 0.0])
+    level = torch.tensor([0.5, 0.0, 0.0, 0.0, 0.0])
+    path = torch.stack([level, torch.zeros(5), height], dim=-1).unsqueeze(1)
+    goal = torch.tensor([[-1.0, 0.0, 0.0]])
+    assert first_as_near(path, goal).tolist() == [3]
+    assert first_as_near(path, goal, torch.tensor([4])).tolist() == [4]

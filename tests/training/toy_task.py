@@ -36,7 +36,8 @@ def record_arrivals(planner, *, num_envs, sequences, seed, num_threads):
     goal = torch.rand(num_envs * sequences, 3, generator=draw)
     arrival = (goal.abs().amax(-1) / STRIDE).ceil().long()
     state = torch.zeros_like(goal) if isinstance(planner, ProportionalController) else torch.ones_like(goal)
-    return {"robot_state": state, "goal": goal, "arrival": arrival, "run": torch.arange(len(goal)) // 2}
+    runs = torch.arange(len(goal)) // 2
+    return {"robot_state": state, "goal": goal, "arrival": arrival, "nearest": arrival, "run": runs}
 
 
 def learned(*, chunk=None, weights=None):

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import inspect
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -96,7 +96,7 @@ class Source:
         task, found = self.home, {}
         for name in task.default_planners:
             planner = task.planner(name, self.static, weights=self.weights)
-            if not isinstance(planner, DynamicPlanner) or keys.TARGET_FUTURE in planner.in_keys:
+            if not isinstance(planner, DynamicPlanner) or keys.TRUTHS & set(planner.in_keys):
                 continue
             found[name] = planner
             search = planner.search
@@ -111,8 +111,7 @@ class Source:
         scene = getattr(planner, "scene", None)
         if self.task is not None or scene in (None, self.home.digest()):
             return self.home
-        others = [name for name in task_names() if name != self.home.name]
-        return next((load_task(name) for name in others if _scene_of(name) == scene), self.home)
+        return next((task for task in _tasks_in_all_scenes() if _scene_of(task) == scene), self.home)
 
 
 def _import_planner(place: str) -> Planner:
@@ -123,9 +122,19 @@ def _import_planner(place: str) -> Planner:
     return maker() if is_maker else found
 
 
-def _scene_of(task: str) -> str | None:
-    """Hash of the scene of the task of that name; None where what it needs is not installed."""
+def _tasks_in_all_scenes() -> Iterator[Task]:
+    """Every task that is known by its name, in each of its scenes."""
+    for name in task_names():
+        try:
+            task = load_task(name)
+        except (ImportError, TorchdynPlanError):
+            continue
+        yield from [task.in_scene(scene) for scene in task.scenes] or [task]
+
+
+def _scene_of(task: Task) -> str | None:
+    """Hash of the scene of ``task``; None where what it needs is not installed."""
     try:
-        return load_task(task).digest()
+        return task.digest()
     except (ImportError, TorchdynPlanError):
         return None

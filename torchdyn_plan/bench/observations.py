@@ -11,7 +11,7 @@ from torch import Tensor, nn
 
 from torchdyn_plan import keys, planners
 from torchdyn_plan.errors import InputError
-from torchdyn_plan.evaluation.episodes import Planner, find_truth
+from torchdyn_plan.evaluation.episodes import Planner, ShownTruth, find_truth
 from torchdyn_plan.planners import DynamicPlanner, Observation, TargetPursuit
 from torchdyn_plan.planners.memory import Remembering
 from torchdyn_plan.tasks.task import Task
@@ -120,13 +120,13 @@ def _play(env: Any, planner: Planner, future: Tensor | None) -> Iterator[tuple[T
     of numbers sees them in its own.
     """
     tensordict, (dtype, own) = env.reset(), (torch.get_default_dtype(), _dtype(planner))
+    truth = ShownTruth(planner, env, future)
     if isinstance(planner, Remembering):
         memory = planner.empty_memory(tensordict[keys.TOOL_POS])
         tensordict[keys.PLAN] = TensorDict(memory, tensordict.batch_size)
     for _ in range(env.max_steps):
         tensordict[keys.GOAL] = tensordict[keys.TARGET_POS].clone()
-        if future is not None:
-            tensordict[keys.TARGET_FUTURE] = future[tensordict[keys.EPISODE].clamp(max=len(future) - 1)]
+        truth.show(tensordict)
         tensordict = _in_type(tensordict, own)
         seen = tensordict.copy()
         acted = planner(tensordict)
@@ -150,7 +150,7 @@ def _in_type(tensordict: Any, dtype: torch.dtype | None) -> Any:
 
 def _future(task: Task, planner: Planner) -> Tensor | None:
     """Where the targets of the episodes go, ``(E, T, 3)`` [m, world], for a planner that reads it."""
-    if keys.TARGET_FUTURE not in getattr(planner, "in_keys", ()):
+    if not keys.TRUTHS & set(getattr(planner, "in_keys", ())):
         return None
     truth = find_truth(task, task.default_settings(), episodes=EPISODES, seed=0, split=SPLIT, num_threads=1)
     return truth.future if truth.future.shape[1] else None

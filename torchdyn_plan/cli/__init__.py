@@ -72,8 +72,8 @@ def _run(words: Sequence[str]) -> None:
     from torchdyn_plan.tasks import load_task
 
     forms.check_words(words)
-    named, others = forms.task_of(words)
-    task = load_task(named)
+    named, scene, others = forms.task_of(words)
+    task = load_task(named, scene)
     if others[:1] == ["train"]:
         networks = forms.train_forms(task, named)
         network = _network(task.name, networks, others[1:])

@@ -32,7 +32,7 @@ def default_folder(base: Path, task: str, static: str = "") -> Path:
 
 @dataclass(frozen=True, kw_only=True)
 class Arguments:
-    """What every command takes; its task is read from the words before anything else."""
+    """What every command takes; its task and scene are read from the words before anything else."""
 
     task: str = DEFAULT
 

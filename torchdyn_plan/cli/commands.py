@@ -46,13 +46,13 @@ def with_folders(task: Task, arguments: Any) -> Any:
         check_choice(f"static planner of {task.name}", arguments.static, task.static_planners)
     if isinstance(arguments, CollectArguments):
         static = arguments.static or task.default_static
-        return replace(arguments, out=arguments.out or default_folder(DATA, task.name, static))
+        return replace(arguments, out=arguments.out or default_folder(DATA, task.weights_name, static))
     if isinstance(arguments, FitArguments):
         static = arguments.static or task.default_static
-        data = arguments.data or default_folder(DATA, task.name, static)
-        return replace(arguments, data=data, out=arguments.out or default_folder(TRAINING, task.name, static))
+        data = arguments.data or default_folder(DATA, task.weights_name, static)
+        return replace(arguments, data=data, out=arguments.out or default_folder(TRAINING, task.weights_name, static))
     if isinstance(arguments, TrainArguments):
-        return replace(arguments, out=arguments.out or default_folder(TRAINING, task.name))
+        return replace(arguments, out=arguments.out or default_folder(TRAINING, task.weights_name))
     return arguments
 
 
@@ -146,7 +146,7 @@ def train(task: Task, network: str, arguments: TrainArguments) -> None:
 def bench(task: Task | None, arguments: BenchArguments) -> None:
     """Measure; write and print each figure once it is there."""
     benchmark = importlib.import_module(BENCHMARKS[arguments.benchmark])
-    own = {one.name: getattr(arguments, one.name) for one in fields(arguments)}
+    own = {one.name: getattr(arguments, one.name) for one in fields(arguments) if one.name != "scene"}
     if task is not None or isinstance(arguments, ReplanArguments):
         own["task"] = task
     if isinstance(arguments, ReplanArguments):

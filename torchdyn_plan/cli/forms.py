@@ -26,6 +26,7 @@ FITTED = {
     "forecaster": "Fit the forecaster to paths of the target.",
     "spread": "Fit how far the forecaster is off, to paths of the target.",
     "eta": "Fit the network of arrival times to runs of a static planner.",
+    "nearest_eta": "The same as the paper has it: times until the robot is as near as it can come, and no *never*.",
 }
 """Networks that are fitted to data, and what ``--help`` says of them."""
 
@@ -38,20 +39,26 @@ def check_words(words: Sequence[str]) -> None:
             raise InputError(f"{option or 'a word'} is given nothing")
 
 
-def task_of(words: Sequence[str]) -> tuple[str, list[str]]:
-    """The task that ``--task NAME`` or ``--task=NAME`` names, the last of several, and the other words."""
-    name, others, rest = DEFAULT, [], iter(words)
+def task_of(words: Sequence[str]) -> tuple[str, str | None, list[str]]:
+    """The task and the scene that ``--task NAME`` and ``--scene NAME`` name, and the other words.
+
+    The last of several counts. The scene is None if none is named.
+    """
+    named: dict[str, str | None] = {"--task": DEFAULT, "--scene": None}
+    others, rest = [], iter(words)
     for word in rest:
-        if word == "--task":
-            name = next(rest, "")
-        elif word.startswith("--task="):
-            name = word.removeprefix("--task=")
-        else:
+        option, equals, value = word.partition("=")
+        if option not in named:
             others.append(word)
             continue
-        if not name or name.startswith("-"):
-            raise InputError(f"--task names none; choose from {', '.join(task_names())}, or give package.module:NAME")
-    return name, others
+        value = value if equals else next(rest, "")
+        if not value or value.startswith("-"):
+            known = f"choose from {', '.join(task_names())}, or give package.module:NAME"
+            raise InputError(f"{option} names none" + (f"; {known}" if option == "--task" else ""))
+        named[option] = value
+    task = named["--task"]
+    assert task is not None
+    return task, named["--scene"], others
 
 
 def command_forms(task: Task, named: str) -> dict[str, type[Arguments]]:
@@ -61,7 +68,7 @@ def command_forms(task: Task, named: str) -> dict[str, type[Arguments]]:
         "sweep": _episode_form(SweepArguments, task, named, over=_over(task)),
         "collect": _form(
             CollectArguments,
-            task=_task_option(named),
+            **_task_options(task, named),
             what=_option(str, "Which data.", choices=("paths", "arrivals"), positional=True),
             static=_static_option(task, "Static planner whose arrivals are measured."),
         ),
@@ -76,12 +83,12 @@ def bench_forms(task: Task, named: str) -> dict[str, type[Arguments]]:
     return {
         "replan": _form(
             ReplanArguments,
-            task=_task_option(named),
+            **_task_options(task, named),
             planner=_repeated_option(f"{planner} {default}", choices),
             static=_static_option(task, "Static planner on which the task's own planners are built."),
         ),
-        "env": _form(EnvArguments, task=_task_option(named)),
-        "kinematics": _form(KinematicsArguments, task=_task_option(named)),
+        "env": _form(EnvArguments, **_task_options(task, named)),
+        "kinematics": _form(KinematicsArguments, **_task_options(task, named)),
     }
 
 
@@ -97,14 +104,14 @@ def train_forms(task: Task, named: str) -> dict[str, type[Arguments]]:
         choices=task.static_planners,
         default=None,
     )
-    shared = {"task": _task_option(named), "static": static}
+    shared = {**_task_options(task, named), "static": static}
     forms = {network: _form(FitArguments, FITTED[network], **shared) for network in fitted}
     for name, training in task.policies.items():
         options = _group(_plain(training.options))
         text = "How it learns: averaged takes the least time; the recipe's own way when not given, which is ddpg."
         algorithm = _option(str | None, text, choices=ALGORITHMS, default=None)
         forms[name] = _form(
-            PolicyArguments, training.summary, task=_task_option(named), training=options, algorithm=algorithm
+            PolicyArguments, training.summary, **_task_options(task, named), training=options, algorithm=algorithm
         )
     return forms
 
@@ -115,7 +122,7 @@ def _episode_form(base: type[EpisodeArguments], task: Task, named: str, **own: A
     )
     return _form(
         base,
-        task=_task_option(named),
+        **_task_options(task, named),
         planners=planners,
         static=_static_option(task, "Static planner that drives the robot."),
         settings=_group(_settings_form(task)),
@@ -144,9 +151,13 @@ def _static_option(task: Task, text: str) -> Any:
     return _option(str, text, choices=task.static_planners, default=task.default_static)
 
 
-def _task_option(named: str) -> Any:
+def _task_options(task: Task, named: str) -> dict[str, Any]:
+    """Options of the task, and of its scene if it has several."""
     text = f"Task: {', '.join(task_names())}, or package.module:NAME. It decides what there is to choose from."
-    return _option(str, text, default=named)
+    found = {"task": _option(str, text, default=named)}
+    if task.scenes:
+        found["scene"] = _option(str, "Scene of the task.", choices=task.scenes, default=task.scene)
+    return found
 
 
 def _option(

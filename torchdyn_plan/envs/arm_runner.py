@@ -45,6 +45,11 @@ class ArmRunner(ABC):
     def robot_state(self) -> Tensor:
         """What a policy or an arrival model reads, ``(N, S)`` float32."""
 
+    @property
+    def tool_pos(self) -> Tensor:
+        """Where the tools are, ``(N, 3)`` [m, world]."""
+        return self._observed()[keys.TOOL_POS]
+
     @abstractmethod
     def _observed(self) -> dict[str, Tensor]:
         """What a static planner sees of the robots, but for goal, step count and memory."""

@@ -153,6 +153,16 @@ class MovingTargetEnv(EnvBase):
     def _flags(self) -> dict[str, Tensor]:
         """What has happened, bool ``(N,)`` for each of `flags`."""
 
+    def true_future(self, rows: Tensor, steps: int) -> Tensor:
+        """Where the targets of ``rows`` (M,) go from now on if the robots stand still: ``(M, steps, 3)`` [m, world].
+
+        Entry k is k + 1 control steps ahead. It is simulated from the present state, on the CPU.
+
+        Raises:
+            InputError: the environment cannot simulate ahead.
+        """
+        raise InputError(f"{type(self).__name__} cannot simulate ahead")
+
     def _picture(self, row: int, width: int, height: int) -> np.ndarray[Any, Any]:
         """A picture of environment ``row`` now, ``(height, width, 3)`` uint8, of tasks that can draw themselves."""
         raise InputError(f"{type(self).__name__} draws no pictures")

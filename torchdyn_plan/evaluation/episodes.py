@@ -19,8 +19,12 @@ from torchdyn_plan.progress import progress_bar
 from torchdyn_plan.tasks.task import Task, Truth, Verdict
 
 Planner = Callable[[TensorDictBase], TensorDictBase]
-"""Anything that writes ``action`` into a tensordict of observations, and returns it. One that reads the recorded truth
-says so: ``target_future`` is among its ``in_keys``."""
+"""Anything that writes ``action`` into a tensordict of observations, and returns it. One that reads the truth says so:
+``target_future`` or ``true_future`` is among its ``in_keys``."""
+OFF_PATH = 0.002
+"""A target this far off its path was touched [m]."""
+RENEWED_EVERY = 5
+"""The future of a target that is being touched is simulated anew every so many control steps."""
 
 
 @dataclass(kw_only=True)
@@ -104,18 +108,59 @@ class EpisodeLog:
             begin += count
 
 
+class ShownTruth:
+    """What planners that know the truth are shown of it: recordings, and how things go on from the present state."""
+
+    def __init__(self, planner: Planner, env: MovingTargetEnv, recorded: Tensor | None) -> None:
+        """Show ``planner`` in ``env`` what it reads of the truth, by ``recorded`` (E, T, 3) paths; nothing for none."""
+        read = getattr(planner, "in_keys", ())
+        known = recorded if recorded is not None and recorded.shape[1] else None
+        self.env, self.recorded = env, known
+        self.shows_recording = known is not None and keys.TARGET_FUTURE in read
+        self.shows_future = known is not None and keys.TRUE_FUTURE in read
+        # The path that each row is on; of episodes that have just begun the recorded one.
+        self._path, self._episode = None, torch.full((env.num_envs,), -1)
+
+    def show(self, tensordict: TensorDictBase) -> None:
+        """Write what the planner reads of the truth into ``tensordict``."""
+        if self.recorded is None:
+            return
+        episode = tensordict[keys.EPISODE].clamp(max=len(self.recorded) - 1)
+        if self.shows_recording:
+            tensordict[keys.TARGET_FUTURE] = self.recorded[episode]
+        if self.shows_future:
+            tensordict[keys.TRUE_FUTURE] = self._future(episode, tensordict)
+
+    def _future(self, episode: Tensor, seen: TensorDictBase) -> Tensor:
+        """Where targets will be at the next steps, ``(N, F, 3)``: F is how far recordings go beyond an episode."""
+        assert self.recorded is not None
+        new, step = episode != self._episode, seen[keys.STEP_COUNT].squeeze(-1)
+        if self._path is None:
+            self._path = self.recorded[episode].clone()
+        self._path[new], self._episode = self.recorded[episode[new]], episode.clone()
+        rows, length = torch.arange(len(step)), self._path.shape[1]
+        off = (self._path[rows, step] - seen[keys.TARGET_POS]).norm(dim=-1) > OFF_PATH
+        stale = (off & (step % RENEWED_EVERY == 0)).nonzero().squeeze(-1)
+        if len(stale):
+            # As long as the row that has most to come needs it.
+            steps = length - 1 - int(step[stale].min())
+            since = torch.arange(length) - step[stale].unsqueeze(-1) - 1
+            index = since.clamp(0, steps - 1).unsqueeze(-1).expand(-1, -1, 3)
+            renewed = self.env.true_future(stale, steps).gather(1, index)
+            self._path[stale] = torch.where(since.unsqueeze(-1) >= 0, renewed, self._path[stale])
+        ahead = torch.arange(1, length - self.env.max_steps)
+        return self._path.gather(1, (step.unsqueeze(-1) + ahead).unsqueeze(-1).expand(-1, -1, 3))
+
+
 def play(planner: Planner, env: MovingTargetEnv, log: EpisodeLog, future: Tensor | None = None) -> Iterator[int]:
     """Step all environments once for each value taken, which is the number of ``log``'s episodes that the step ended.
 
-    ``future`` (E, T, 3) is the recorded truth for planners that read ``target_future``; None or T = 0 for none.
+    ``future`` (E, T, 3) is the recorded truth for planners that read ``target_future`` or ``true_future``; None or T =
+    0 for none.
     """
-    shown = future if keys.TARGET_FUTURE in getattr(planner, "in_keys", ()) else None
-    if shown is not None and not shown.shape[1]:
-        shown = None
-    tensordict = env.reset()
+    truth, tensordict = ShownTruth(planner, env, future), env.reset()
     while True:
-        if shown is not None:
-            tensordict[keys.TARGET_FUTURE] = shown[tensordict[keys.EPISODE].clamp(max=len(shown) - 1)]
+        truth.show(tensordict)
         stepped, tensordict = env.step_and_maybe_reset(planner(tensordict))
         yield log.add(stepped)
 

@@ -115,11 +115,15 @@ class Arm(Precise):
         cls,
         *,
         tool_length: float = 0.0,
+        speed_limit: float = UR5_SPEED_LIMIT,
         dtype: torch.dtype = torch.float32,
         device: torch.device | str | None = None,
     ) -> Arm:
-        """The UR5 with its tool frame ``tool_length`` [m] in front of the flange, along the flange's z axis."""
-        return cls.from_urdf(ur5_urdf(tool_length), tip="tool", speed_limit=UR5_SPEED_LIMIT, dtype=dtype, device=device)
+        """The UR5 with its tool frame ``tool_length`` [m] in front of the flange, along the flange's z axis.
+
+        ``speed_limit`` is that of every joint [rad/s].
+        """
+        return cls.from_urdf(ur5_urdf(tool_length), tip="tool", speed_limit=speed_limit, dtype=dtype, device=device)
 
     @classmethod
     def from_urdf(cls, source: Source, *, tip: str, base: str | None = None, **options: Any) -> Arm:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from typing import NamedTuple
 
@@ -136,6 +137,11 @@ def arrival_moments(logits: Tensor, bin_width: int) -> Tensor:
     bins = logits.shape[-1] - 1
     middle = bin_width * torch.arange(bins, device=logits.device, dtype=logits.dtype) + (bin_width - 1) / 2
     return torch.nn.functional.pad(torch.stack([torch.ones_like(middle), middle], dim=-1), (0, 0, 0, 1))
+
+
+def without_never(scores: Tensor) -> Tensor:
+    """Scores ``(*B, bins + 1)`` of a network that scores ``(*B, bins)`` alone: *never* has probability 0."""
+    return torch.nn.functional.pad(scores, (0, 1), value=-math.inf)
 
 
 def decode_soft(logits: Tensor, *, bin_width: int = 5) -> Arrival:

@@ -11,7 +11,7 @@ from torch import Tensor, nn
 from torchdyn_plan.checks import check_choice, check_number, network_input
 from torchdyn_plan.errors import InputError
 from torchdyn_plan.nets.arrival import ArrivalModel
-from torchdyn_plan.nets.distributions import ESTIMATORS, Arrival
+from torchdyn_plan.nets.distributions import ESTIMATORS, Arrival, without_never
 from torchdyn_plan.nets.pretrained import Pretrained
 from torchdyn_plan.precision import EXACT, Precise, autocast_is_on, without_autocast
 
@@ -28,7 +28,10 @@ class ETAConfig:
     tool_slice: tuple[int, int] = (12, 15)
     """First and one-past-last entry of the robot state that hold the tool position."""
     bins: int = 100
-    """Bins of arrival time; one more class means *never arrives*."""
+    """Bins of arrival time."""
+    never: bool = True
+    """Whether one more class means *never arrives*. Without it, as in the paper, the time to a place out of reach is
+    that until the robot is as near as it can come."""
     bin_width: int = 5
     """Control steps in a bin."""
     hidden: int = 192
@@ -37,6 +40,8 @@ class ETAConfig:
     def __post_init__(self) -> None:
         for name in ("robot_state_size", "bins", "bin_width", "hidden"):
             check_number(name, getattr(self, name), minimum=1, integer=True)
+        if not isinstance(self.never, bool):
+            raise InputError(f"never must be True or False, got {self.never!r}")
         object.__setattr__(self, "tool_slice", tuple(self.tool_slice))
         first, last = self.tool_slice
         if not 0 <= first < last <= self.robot_state_size or last - first != 3:
@@ -69,7 +74,7 @@ class ETANetwork(Pretrained, Precise, ArrivalModel):
         self.goal_in = nn.Linear(8, hidden, bias=False)
         self.second = nn.Linear(hidden, hidden)
         self.third = nn.Linear(hidden, hidden)
-        self.head = nn.Linear(hidden, config.bins + 1)
+        self.head = nn.Linear(hidden, config.bins + config.never)
         for name, width in (("state", size), ("goal", 8)):
             self.register_buffer(f"{name}_shift", torch.zeros(width))
             self.register_buffer(f"{name}_scale", torch.ones(width))
@@ -84,7 +89,7 @@ class ETANetwork(Pretrained, Precise, ArrivalModel):
             getattr(self, f"{name}_shift").copy_(-values.mean(dim=0) * scale)
 
     def forward(self, robot_state: Tensor, goal: Tensor) -> Tensor:
-        """Scores of the bins; the last one stands for *never arrives*.
+        """Scores of the bins; the last one stands for *never arrives*, and is -∞ where the network has no such class.
 
         Args:
             robot_state: ``(*B, S)``; its batch broadcasts against the goal's, ``(*B, 1, S)`` with ``(*B, K, 3)``
@@ -108,7 +113,8 @@ class ETANetwork(Pretrained, Precise, ArrivalModel):
             state, target = state.to(stored), target.to(stored)
         hidden = (self.state_in(state) + self.goal_in(target)).relu_()
         rows = self.third(self.second(hidden.view(-1, self.config.hidden)).relu_()).relu_()
-        scores = self.head(rows).view(*hidden.shape[:-1], self.config.bins + 1)
+        scores = self.head(rows).view(*hidden.shape[:-1], -1)
+        scores = scores if self.config.never else without_never(scores)
         return scores if scores.dtype == goal.dtype else scores.to(goal.dtype)
 
     def arrival(self, robot_state: Tensor, goal: Tensor, *, estimator: str = "mode") -> Arrival:

@@ -15,7 +15,7 @@ from torch import Tensor, nn
 
 from torchdyn_plan.checks import check_choice, network_input
 from torchdyn_plan.nets.arrival import ArrivalModel, ArrivalQuery
-from torchdyn_plan.nets.distributions import ESTIMATORS, Arrival, Spread, arrival_moments
+from torchdyn_plan.nets.distributions import ESTIMATORS, Arrival, Spread, arrival_moments, without_never
 from torchdyn_plan.nets.forecast import DescribedForecast, Forecast
 from torchdyn_plan.precision import Precise, autocast_is_on, in_type_of, without_autocast
 
@@ -270,8 +270,8 @@ class InferenceETA(Precise, ArrivalModel):
         hidden = (torch.cat([goal.expand(offset.shape), lengths], dim=-1) @ self.goal_weight).add_(state).relu_()
         rows = torch.addmm(self.second_bias, hidden.view(-1, self.config.hidden), self.second_weight).relu_()
         rows = torch.addmm(self.third_bias, rows, self.third_weight).relu_()
-        rows = torch.addmm(self.head_bias, rows, self.head_weight)
-        return rows.view(*hidden.shape[:-1], self.config.bins + 1)
+        rows = torch.addmm(self.head_bias, rows, self.head_weight).view(*hidden.shape[:-1], -1)
+        return rows if self.config.never else without_never(rows)
 
 
 def _turns(network: Forecaster) -> Tensor:

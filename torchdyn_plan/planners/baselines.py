@@ -92,12 +92,41 @@ class RecordedFuture(ForecastModel):
         return {"horizon": self.horizon}
 
 
-def oracle_trajectory(static: StaticPlanner, eta: Any, *, horizon: int = 300, **parts: Any) -> DynamicPlanner:
-    """The dynamic planner with the recorded truth, ``target_future`` (*B, T, 3), as its forecast (paper, IV-A.2).
+class TrueFuture(ForecastModel):
+    """Stands in for a forecaster and tells the truth, whatever has happened: ``true_future``, as long as it is shown.
 
-    ``horizon`` [control steps] is as far as its search may look; ``parts`` are those of `DynamicPlanner`.
+    An evaluation simulates it from the present state, the robot held still, wherever the target has left what was
+    simulated before.
     """
-    return DynamicPlanner(static, RecordedFuture(horizon), eta, **parts)
+
+    in_keys = (keys.TRUE_FUTURE,)
+
+    def predict(self, *seen: Tensor) -> Forecast:
+        """Positions at steps t+1 … t+F, ``(*B, F, 3)`` [m, world], as they are shown."""
+        (true_future,) = seen
+        check_trailing_shape(keys.TRUE_FUTURE, true_future, true_future.shape[-2], 3)
+        check_finite(keys.TRUE_FUTURE, true_future)
+        return Forecast(true_future)
+
+    def part_settings(self) -> dict[str, Any]:
+        """None."""
+        return {}
+
+
+def oracle_trajectory(
+    static: StaticPlanner, eta: Any, *, horizon: int = 300, recorded: bool = True, **parts: Any
+) -> DynamicPlanner:
+    """The dynamic planner with the truth as its forecast (paper, IV-A.2).
+
+    Args:
+        static: as of `DynamicPlanner`, like ``eta`` and ``parts``.
+        eta: tells how long ``static`` takes to a goal.
+        horizon: as far as its search may look into a recording [control steps].
+        recorded: the truth is what was recorded before the episode with the robot at its start, ``target_future``
+            (*B, T, 3), and no longer true once the target was touched; else ``true_future`` (*B, F, 3), which is.
+        **parts: as of `DynamicPlanner`.
+    """
+    return DynamicPlanner(static, RecordedFuture(horizon) if recorded else TrueFuture(), eta, **parts)
 
 
 def wait_at_end(static: StaticPlanner, forecaster: Any, eta: Any, **parts: Any) -> DynamicPlanner:

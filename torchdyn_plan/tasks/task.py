@@ -24,6 +24,8 @@ if TYPE_CHECKING:
 
     from torchdyn_plan.envs.moving_target import MovingTargetEnv
 
+NEAREST_ETA = "nearest_eta"
+"""Network of the times until the robot is as near to a goal as it can come, and the end of its weights' name."""
 ENTRY_POINTS = "torchdyn_plan.tasks"
 """Group of entry points in which other packages name their tasks, ``name = "package.module:NAME"``."""
 
@@ -158,6 +160,10 @@ class Task:
     time, and file or folder of a policy's weights, None for those that ship. The first is taken when none is named."""
     planners: Mapping[str, Callable[[PlannerParts], Any]]
     """Makers of planners for the moving target by name, from the parts that they may need."""
+    scene: Any = ""
+    """Its scene, by the name in ``scenes`` or itself, if there are several."""
+    scenes: Mapping[str, Callable[[], Task]] = field(default_factory=dict)
+    """The same task in each of its scenes, by the scene's name; the first is the one that its name alone stands for."""
     rivals: tuple[str, ...] = ()
     """Planners that run only when they are named."""
     rows_at_once: tuple[int, int] = (32, 64)
@@ -175,7 +181,7 @@ class Task:
     (tensors of their numbers), laid end to end: ``positions start length pocketed velocity``."""
     record_arrivals: Callable[..., dict[str, Tensor]] | None = None
     """``(planner, *, num_envs, sequences, seed, num_threads)`` to runs of a static planner: ``robot_state goal arrival
-    run``; None if no arrival model is trained."""
+    nearest run``; None if no arrival model is trained."""
     fitting: Callable[[], Any] | None = None
     """Makes the `torchdyn_plan.training.fitting.Fitting`: sizes of networks, and how they are scored."""
     policies: Mapping[str, PolicyTraining] = field(default_factory=dict)
@@ -192,6 +198,22 @@ class Task:
     def default_planners(self) -> tuple[str, ...]:
         """Planners that run when none are named."""
         return tuple(name for name in self.planners if name not in self.rivals)
+
+    @property
+    def weights_name(self) -> str:
+        """What its weights that ship are called: its name, and its scene unless that is the first."""
+        if self.scene == next(iter(self.scenes), ""):
+            return self.name
+        return f"{self.name}-{self.scene if self.scene in self.scenes else self.digest()}"
+
+    def in_scene(self, scene: str) -> Task:
+        """The same task in the scene of that name; raises `InputError` if there is none."""
+        from torchdyn_plan.checks import check_choice
+
+        if not self.scenes:
+            raise InputError(f"{self.name} has one scene alone, got {scene!r}")
+        check_choice(f"scene of {self.name}", scene, self.scenes)
+        return self.scenes[scene]()
 
     def static_planner(self, name: str | None = None, *, chunk: int | None = None, weights: Any = None) -> Any:
         """The static planner of that name, the default one for None; raises `InputError`, or `WeightsError`."""
@@ -261,21 +283,30 @@ class PlannerParts:
         """The `Forecaster`, frozen."""
         from torchdyn_plan.nets import Forecaster
 
-        return self._load(Forecaster, self.task.name)
+        return self._load(Forecaster, self.task.weights_name)
 
     @property
     def spread_forecaster(self) -> Any:
         """The `Forecaster` with its `SpreadNetwork`, frozen."""
         from torchdyn_plan.nets import SpreadForecaster, SpreadNetwork
 
-        return SpreadForecaster(self.forecaster, self._load(SpreadNetwork, self.task.name)).eval()
+        return SpreadForecaster(self.forecaster, self._load(SpreadNetwork, self.task.weights_name)).eval()
 
     @property
     def eta(self) -> Any:
         """The `ETANetwork` of the static planner, frozen."""
         from torchdyn_plan.nets import ETANetwork
 
-        return self._load(ETANetwork, f"{self.task.name}-{self.static_name}")
+        return self._load(ETANetwork, f"{self.task.weights_name}-{self.static_name}")
+
+    @property
+    def nearest_eta(self) -> Any:
+        """The `ETANetwork` of the static planner that knows no *never*, as the paper's, frozen."""
+        from torchdyn_plan.nets import ETANetwork
+
+        if self.weights is None:
+            return self._load(ETANetwork, f"{self.task.weights_name}-{self.static_name}-nearest")
+        return ETANetwork.from_pretrained(self.weights / NEAREST_ETA).requires_grad_(False)
 
     def _load(self, kind: Any, name: str) -> Any:
         return kind.from_pretrained(name if self.weights is None else self.weights).requires_grad_(False)
@@ -298,12 +329,19 @@ def task_names() -> list[str]:
     return sorted({*_registered, *shipped, *others})
 
 
-def load_task(name: str | Task) -> Task:
+def load_task(name: str | Task, scene: str | None = None) -> Task:
     """The task of that name, or at ``package.module:NAME`` if it is nowhere registered; a `Task` is returned as it is.
 
+    ``scene`` is the name of one of its scenes, as `Task.in_scene` takes it; None for the task as it comes.
+
     Raises:
-        InputError: there is no such task; the message lists those there are.
+        InputError: there is no such task or scene; the message lists those there are.
     """
+    task = _find_task(name)
+    return task if scene is None else task.in_scene(scene)
+
+
+def _find_task(name: str | Task) -> Task:
     if isinstance(name, Task):
         return name
     if name in _registered:

@@ -20,6 +20,8 @@ class Arrivals(NamedTuple):
     """(n, 3) [m, world]."""
     arrival: Tensor
     """(n,) int64 control steps until the goal was reached, -1 for never."""
+    nearest: Tensor
+    """(n,) int64 control steps until the tool was as near to the goal as it came."""
     run: Tensor
     """(n,) int64: samples with one number come from one run."""
 
@@ -37,8 +39,11 @@ def load_arrivals(folder: Path, *, state_size: int | None = None) -> Arrivals:
     shards = read_shards(folder, "arrivals", Arrivals._fields)
     data = Arrivals(*(torch.cat([shard[name] for shard in shards]) for name in Arrivals._fields))
     check_trailing_shape("goal", data.goal, 3)
-    if data.arrival.dtype != torch.int64 or data.run.dtype != torch.int64 or bool((data.arrival < -1).any()):
-        raise InputError(f"arrival and run in {str(folder)!r} must be whole numbers, arrivals from -1 upwards")
+    for name, least in (("arrival", -1), ("nearest", 0), ("run", None)):
+        values = getattr(data, name)
+        if values.dtype != torch.int64 or (least is not None and bool((values < least).any())):
+            upwards = "" if least is None else f" from {least} upwards"
+            raise InputError(f"{name} of the arrivals in {str(folder)!r} must be whole numbers{upwards}")
     if state_size is not None:
         check_trailing_shape("robot_state of the arrivals", data.robot_state, state_size)
     for name, tensor in zip(Arrivals._fields, data, strict=True):

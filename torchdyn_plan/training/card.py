@@ -31,8 +31,12 @@ def write_network(
     task: str,
     recipe: Recipe,
     facts: Mapping[str, Any],
+    network_name: str | None = None,
 ) -> Path:
-    """Write a fitted network, its scores as ``scores.json`` and its card into ``folder``; returns the weights' file."""
+    """Write a fitted network, its scores as ``scores.json`` and its card into ``folder``; returns the weights' file.
+
+    ``network_name`` is what the command line calls the network; its kind for None.
+    """
     network.eval()
     with torch.no_grad():
         tables = score()
@@ -40,7 +44,7 @@ def write_network(
     write_json(folder / "scores.json", tables)
     given = f"--steps {recipe.steps} --batch {recipe.batch} --lr {recipe.lr:g} --seed {recipe.seed}"
     facts = {
-        "command": f"`torchdyn-plan train {network.kind} --task {task} {given}`",
+        "command": f"`torchdyn-plan train {network_name or network.kind} --task {task} {given}`",
         "recipe": asdict(recipe),
         **facts,
         "network": asdict(network.config),

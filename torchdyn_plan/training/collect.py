@@ -25,7 +25,7 @@ from torchdyn_plan.versions import library_versions
 
 ENTRIES = {
     "paths": ("positions", "start", "length", "pocketed", "velocity"),
-    "arrivals": ("robot_state", "goal", "arrival", "run"),
+    "arrivals": ("robot_state", "goal", "arrival", "nearest", "run"),
 }
 """Tensors in a shard of each kind of data."""
 SERIES = 1_000_003

@@ -115,11 +115,13 @@ def fit_eta(
     config: ETAConfig | None = None,
     static: str | None = None,
     resume: bool = True,
+    name: str = ETANetwork.kind,
 ) -> Path:
     """Fit an `ETANetwork` to the ``arrivals`` in ``data``; one in ten runs is held out and scored.
 
-    ``config`` is the task's by default; data of another static planner than ``static`` are refused, unless it is None;
-    without ``resume`` a checkpoint in ``out`` is not continued.
+    One without the class *never* is fitted to the times until the robot was as near as it came. ``config`` is the
+    task's by default; ``name`` is that of its folder in ``out``; data of another static planner than ``static`` are
+    refused, unless it is None; without ``resume`` a checkpoint in ``out`` is not continued.
     """
     fitting = task_fitting(task)
     config, recipe = config or fitting.eta, recipe or fitting.recipe("eta")
@@ -127,6 +129,9 @@ def fit_eta(
     if static not in (None, about["static"]):
         raise InputError(f"arrivals in {short_path(Path(data))} are of {about['static']}, not of {static}")
     samples = load_arrivals(data, state_size=config.robot_state_size)
+    if not config.never:
+        latest = config.bins * config.bin_width - 1
+        samples = samples._replace(arrival=samples.nearest.clamp(max=latest))
     train, held = (samples.take(rows) for rows in split_groups(samples.run, recipe.seed))
     device = recipe.device
     torch.manual_seed(recipe.seed)
@@ -137,9 +142,10 @@ def fit_eta(
 
     def loss(generator: torch.Generator) -> Tensor:
         rows = torch.randint(len(train.run), (recipe.batch,), generator=generator)
-        state, goal, arrival, _ = train.take(rows)
-        classes, _ = arrival_classes(arrival, bins=config.bins, bin_width=config.bin_width)
-        return cross_entropy(network(state.to(device), goal.to(device)), classes.to(device))
+        drawn = train.take(rows)
+        classes, _ = arrival_classes(drawn.arrival, bins=config.bins, bin_width=config.bin_width)
+        scores, known = network(drawn.robot_state.to(device), drawn.goal.to(device)), config.bins + config.never
+        return cross_entropy(scores[:, :known], classes[:, :known].to(device))
 
     def score() -> Tables:
         logits = _in_parts(
@@ -150,10 +156,10 @@ def fit_eta(
 
     driver = {name: about[name] for name in ("static", "weights") if name in about}
     settings = {"network": asdict(config), "scene": about["scene"], "samples": len(samples.run)} | driver
-    folder = out / ETANetwork.kind
+    folder = out / name
     optimise(network, loss, lambda: _arrival_figures(score()), recipe, out=folder, settings=settings, resume=resume)
-    counts = {"samples": len(samples.run), "held out": len(held.run)}
-    return write_network(network, folder, score, task=task.name, recipe=recipe, facts=about | counts)
+    facts = about | {"samples": len(samples.run), "held out": len(held.run)}
+    return write_network(network, folder, score, task=task.name, recipe=recipe, facts=facts, network_name=name)
 
 
 def _in_parts(forward: Callable[[slice], Tensor], count: int) -> Tensor:

@@ -13,6 +13,8 @@ from torchdyn_plan.checks import check_number
 
 STATES_PER_RUN = 5
 """Intermediate states taken from each run (paper, Section III-B.3)."""
+AS_NEAR = 0.015
+"""A tool that is so near to the place where it is nearest to its goal is as near as it comes [m]."""
 
 
 class Runner(Protocol):
@@ -21,6 +23,11 @@ class Runner(Protocol):
     @property
     def robot_state(self) -> Tensor:
         """What an ETA network reads, ``(N, S)``."""
+        ...
+
+    @property
+    def tool_pos(self) -> Tensor:
+        """Where the tools are, ``(N, 3)`` [m, world]."""
         ...
 
     def reset(self) -> None:
@@ -55,12 +62,14 @@ class RunPlan:
     """By then a new goal has set a robot in motion."""
     redirected: float = 0.35
     """Share of runs that are given another goal on their way, and teach nothing themselves."""
+    states: int = STATES_PER_RUN
+    """Samples taken from each run."""
     comes_to_rest: bool = True
     """The robot comes to rest where it cannot get nearer to its goal: a run that is given up before teaches nothing.
     Otherwise such a run never arrives."""
 
     def __post_init__(self) -> None:
-        for name in ("sequence", "longest", "redirected_within"):
+        for name in ("sequence", "longest", "redirected_within", "states"):
             check_number(name, getattr(self, name), minimum=1, integer=True)
         check_number("longest", self.longest, maximum=self.sequence)
         check_number("starting", self.starting, minimum=0, integer=True)
@@ -86,17 +95,19 @@ def record_sequence(runner: Runner, plan: RunPlan, draw: torch.Generator) -> dic
         draw: source of goals, redirections and sampled states.
 
     Returns:
-        n samples, `STATES_PER_RUN` of each run, the first at its start: ``robot_state`` (n, S), ``goal`` (n, 3)
-        [m, world], ``arrival`` (n,) control steps from the state to the goal or -1 for never, ``run`` (n,) numbers.
+        n samples, ``plan.states`` of each run, the first at its start: ``robot_state`` (n, S), ``goal`` (n, 3)
+        [m, world], ``arrival`` (n,) control steps from the state to the goal or -1 for never, ``nearest`` (n,) control
+        steps until the tool was as near to the goal as it came, ``run`` (n,) numbers.
     """
     runner.reset()
     count, size = runner.robot_state.shape
-    states = torch.empty(plan.sequence + 1, count, size)
+    states, tools = (torch.empty(plan.sequence + 1, count, width) for width in (size, 3))
     goal, given = plan.goals(count, draw), torch.zeros(count, dtype=torch.int64)
     turning = _turning(plan, count, draw)
     samples: list[dict[str, Tensor]] = []
     for step in range(plan.sequence + 1):
         states[step] = runner.robot_state
+        tools[step] = runner.tool_pos
         age = step - given
         arrived = runner.is_reached(goal)
         still = torch.zeros_like(arrived)
@@ -107,12 +118,15 @@ def record_sequence(runner: Runner, plan: RunPlan, draw: torch.Generator) -> dic
         rows = ended.nonzero().squeeze(-1)
         if len(rows):
             teaches = rows[(arrived | still | (given_up & (not plan.comes_to_rest)))[rows]]
-            taken = given[teaches].unsqueeze(-1) + _within(step - given[teaches], draw)
+            taken = given[teaches].unsqueeze(-1) + _within(step - given[teaches], plan.states, draw)
+            nearest = first_as_near(tools[: step + 1, teaches], goal[teaches], given[teaches])
+            nearest = torch.where(arrived[teaches], step, nearest)
             samples.append(
                 {
                     "robot_state": states[taken, teaches.unsqueeze(-1)].flatten(0, 1),
-                    "goal": goal[teaches].repeat_interleave(STATES_PER_RUN, 0),
+                    "goal": goal[teaches].repeat_interleave(plan.states, 0),
                     "arrival": torch.where(arrived[teaches].unsqueeze(-1), step - taken, -1).flatten(),
+                    "nearest": (nearest.unsqueeze(-1) - taken).clamp_min(0).flatten(),
                 }
             )
             goal[rows], given[rows] = plan.goals(len(rows), draw), step
@@ -120,8 +134,25 @@ def record_sequence(runner: Runner, plan: RunPlan, draw: torch.Generator) -> dic
         # A goal's tensor belongs to the planner's memory from here on.
         runner.step(goal.clone())
     whole = {name: torch.cat([sample[name] for sample in samples]) for name in samples[0]}
-    whole["run"] = torch.arange(len(whole["goal"])) // STATES_PER_RUN + torch.randint(2**40, (1,), generator=draw)
+    whole["run"] = torch.arange(len(whole["goal"])) // plan.states + torch.randint(2**40, (1,), generator=draw)
     return whole
+
+
+def first_as_near(tool_pos: Tensor, goal: Tensor, given: Tensor | None = None) -> Tensor:
+    """First step ``(M,)`` at which tools are within `AS_NEAR` of the place nearest to their goals that they come to.
+
+    Args:
+        tool_pos: ``(T, M, 3)`` at steps 0 … T-1 [m, world].
+        goal: ``(M, 3)`` [m, world].
+        given: ``(M,)`` step from which on places count; all for None.
+    """
+    away = (tool_pos - goal).norm(dim=-1)
+    before = torch.zeros_like(away, dtype=torch.bool)
+    if given is not None:
+        before = torch.arange(len(away)).unsqueeze(-1) < given
+    nearest = away.masked_fill(before, torch.inf).argmin(0)
+    place = tool_pos[nearest, torch.arange(len(nearest))]
+    return (((tool_pos - place).norm(dim=-1) <= AS_NEAR) & ~before).int().argmax(0)
 
 
 def _turning(plan: RunPlan, count: int, draw: torch.Generator) -> Tensor:
@@ -130,8 +161,8 @@ def _turning(plan: RunPlan, count: int, draw: torch.Generator) -> Tensor:
     return torch.where(chance < plan.redirected, 1 + (when * plan.redirected_within).long(), plan.longest)
 
 
-def _within(length: Tensor, draw: torch.Generator) -> Tensor:
-    """`STATES_PER_RUN` steps of each run of ``length`` (M,), its ends included and the first its start: (M, 5)."""
-    share = torch.rand(len(length), STATES_PER_RUN, generator=draw)
+def _within(length: Tensor, count: int, draw: torch.Generator) -> Tensor:
+    """``count`` steps of each run of ``length`` (M,), its ends included and the first its start: ``(M, count)``."""
+    share = torch.rand(len(length), count, generator=draw)
     share[:, 0] = 0.0
     return (share * (length + 1).unsqueeze(-1)).long()

@@ -8,7 +8,7 @@ from typing import Any
 
 from torchdyn_plan.errors import InputError
 from torchdyn_plan.files import is_file
-from torchdyn_plan.tasks.task import Task, load_task
+from torchdyn_plan.tasks.task import NEAREST_ETA, Task, load_task
 
 
 def networks(task: Task) -> tuple[str, ...]:
@@ -18,7 +18,7 @@ def networks(task: Task) -> tuple[str, ...]:
         if task.record_paths is not None:
             fitted += ("forecaster", "spread")
         if task.record_arrivals is not None:
-            fitted += ("eta",)
+            fitted += ("eta", NEAREST_ETA)
     return (*fitted, *task.policies)
 
 
@@ -45,8 +45,8 @@ def train(
 
     Args:
         task: whose network, or its name.
-        network: ``forecaster``, ``eta``, ``spread``, or one of the task's policies. A spread is fitted to the errors of
-            the forecaster in ``out``, or of the one that ships if there is none.
+        network: ``forecaster``, ``eta``, ``nearest_eta``, ``spread``, or one of the task's policies. A spread is
+            fitted to the errors of the forecaster in ``out``, or of the one that ships if there is none.
         data: folder of the collected shards; a policy reads none.
         out: gets a folder of the network's name with checkpoint, curve, weights and card.
         steps: optimiser steps, of a policy rounds; the recipe's own for None, as are ``batch`` and ``lr``.
@@ -58,7 +58,7 @@ def train(
         num_envs: of a policy: episodes that run side by side; the recipe's own for None.
         num_threads: of a policy: threads of the simulation, 0 for all cores; does not change the result.
         workers: of a policy: Ray workers that run the episodes, 0 for none.
-        static: of ``eta``: the static planner whose arrivals the data must be; whichever it is for None.
+        static: of ``eta`` and ``nearest_eta``: the static planner whose arrivals the data must be; any for None.
         options: of a policy: an instance of its `PolicyTraining.options`; the defaults for None.
         algorithm: of a policy: ``ddpg``, ``averaged``; that of the task's recipe for None.
 
@@ -85,14 +85,16 @@ def train(
     _refuse_policy_arguments(network, num_envs=num_envs, workers=workers or None, options=options, algorithm=algorithm)
     from torchdyn_plan.training import fit, fit_spread
 
-    own = fit.task_fitting(task).recipe(network)
+    fitting = fit.task_fitting(task)
+    own = fitting.recipe("eta" if network == NEAREST_ETA else network)
     recipe = changed(own, steps=steps, lr=lr, device=device, **given)
     if network == "forecaster":
         return fit.fit_forecaster(task, data, out, recipe, resume=resume)
-    if network == "eta":
-        return fit.fit_eta(task, data, out, recipe, static=static, resume=resume)
+    if network in ("eta", NEAREST_ETA):
+        config = dataclasses.replace(fitting.eta, never=network == "eta")
+        return fit.fit_eta(task, data, out, recipe, config=config, static=static, resume=resume, name=network)
     beside = out / "forecaster" / "forecaster.safetensors"
-    forecaster = beside if is_file(beside) else task.name
+    forecaster = beside if is_file(beside) else task.weights_name
     return fit_spread.fit_spread(task, data, out, recipe, forecaster=forecaster, resume=resume)
 
 

@@ -7,7 +7,7 @@ from torchrl.envs.utils import check_env_specs
 
 from torchdyn_plan import keys
 from torchdyn_plan.envs import TrapperEnv, TrapperGoalEnv, TrapperScene
-from torchdyn_plan.envs.trapper.env import HOLD_STEPS
+from torchdyn_plan.envs.trapper.env import HOLD_STEPS, LAST_HOLD_STEPS
 from torchdyn_plan.envs.trapper.keys import KEYS, TOOL_ROTATION
 from torchdyn_plan.errors import InputError
 from torchdyn_plan.kinematics import Arm
@@ -98,6 +98,53 @@ def test_a_ball_that_is_uncovered_again_starts_its_time_over():
         assert not td["trapped"].any()
     put_ball(td["tool_pos"][0])
     assert bool(env.step(planner(td.set("goal", goal)))["next", "trapped"])
+
+
+def test_at_the_end_of_an_episode_a_ball_need_not_be_covered_so_long():
+    steps = {}
+    for held in (LAST_HOLD_STEPS - 1, LAST_HOLD_STEPS):
+        env = make_env(1, static_target=True, max_steps=150 + held)
+        td, planner = env.reset(), straight_down()
+        goal = torch.cat([td["tool_pos"][:, :2], torch.tensor([[0.01]])], dim=-1)
+        for step in range(150 + held):
+            away = td["tool_pos"][0, :2] + 0.3 * (step < 150)
+            env.simulation.ball_pos[0] = torch.cat([away, torch.tensor([SCENE.ball_radius])]).double()
+            env.simulation.ball_vel.zero_()
+            td = env.step_mdp(env.step(planner(td.set("goal", goal))))
+            assert not td["trapped"].any() or step == 150 + held - 1
+        steps[held] = bool(td["trapped"])
+    assert steps == {LAST_HOLD_STEPS - 1: False, LAST_HOLD_STEPS: True}
+
+
+def test_the_true_future_is_where_the_balls_go_while_the_arms_stand_still():
+    env = make_env(3, velocity=3.0, num_threads=1)
+    td = env.reset()
+    for _ in range(20):
+        td = env.step(td.set("action", torch.zeros(3, 6)))["next"]
+    before = env.simulation.qpos.clone()
+    future = env.true_future(torch.tensor([0, 2]), 150)
+    assert torch.equal(env.simulation.qpos, before)
+    path = []
+    for _ in range(150):
+        td = env.step(td.set("action", torch.zeros(3, 6)))["next"]
+        path.append(td["target_pos"][[0, 2]])
+    torch.testing.assert_close(future, torch.stack(path, dim=1), atol=1e-3, rtol=0)
+
+
+def test_the_true_future_holds_arms_that_move_and_lets_balls_bounce_off_them():
+    env = make_env(1, velocity=0.0, static_target=True, num_threads=1)
+    td, planner = env.reset(), straight_down()
+    goal = torch.cat([td["tool_pos"][:, :2], torch.tensor([[0.01]])], dim=-1)
+    for _ in range(150):
+        td = env.step_mdp(env.step(planner(td.set("goal", goal))))
+    tool = td["tool_pos"][0, :2].double()
+    start = tool + torch.tensor([SCENE.box_outer + SCENE.ball_radius + 0.1, 0.0])
+    env.simulation.ball_pos[0, :2], env.simulation.ball_pos[0, 2] = start, SCENE.ball_radius
+    env.simulation.ball_vel[0] = torch.tensor([-1.0, 0.0, 0.0])
+    env.simulation.joint_vel[:] = 1.0
+    x = env.true_future(torch.tensor([0]), 100)[0, :, 0]
+    assert x.min() > tool[0] + SCENE.box_outer + 0.7 * SCENE.ball_radius
+    assert x[-1] > x.min() + 0.01, "it came back"
 
 
 def test_a_ball_pushed_along_by_the_box_is_no_success():

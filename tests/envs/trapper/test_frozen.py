@@ -8,7 +8,7 @@ import pytest
 import torch
 
 from torchdyn_plan.envs import TrapperScene, TrapperSimulation
-from torchdyn_plan.envs.trapper.env import HOLD_STEPS, MAX_STEPS
+from torchdyn_plan.envs.trapper.env import HOLD_STEPS, LAST_HOLD_STEPS, MAX_STEPS
 from torchdyn_plan.envs.trapper.starts import draw_starts
 from torchdyn_plan.errors import InputError
 
@@ -56,7 +56,7 @@ def weighted(values):
 
 def test_the_scene():
     assert SCENE.digest() == "cc49d789bb82e1c9", FROZEN
-    assert (MAX_STEPS, HOLD_STEPS) == (500, 10), FROZEN
+    assert (MAX_STEPS, HOLD_STEPS, LAST_HOLD_STEPS) == (500, 50, 10), FROZEN
 
 
 @pytest.mark.parametrize(("name", "expected"), (BODIES | CONTACTS).items())

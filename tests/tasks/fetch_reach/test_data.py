@@ -71,7 +71,8 @@ def test_arrivals_are_grouped_by_height_and_gripper_speed():
     state = torch.zeros(3, STATE_SIZE)
     state[1, 6] = 0.01
     goal = torch.tensor([[1.3, 0.7, HEIGHT], [1.3, 0.7, 0.6], [1.3, 0.7, HEIGHT]])
-    groups = fetch_reach_fitting().groups(Arrivals(state, goal, torch.tensor([29, 30, -1]), torch.arange(3)))
+    run = torch.arange(3)
+    groups = fetch_reach_fitting().groups(Arrivals(state, goal, torch.tensor([29, 30, -1]), run, run))
     assert groups["level"].tolist() == [True, False, True]
     assert groups["in motion"].tolist() == [False, True, False]
 

@@ -172,7 +172,8 @@ def test_arrivals_are_grouped_by_height_and_joint_speed():
     state = torch.zeros(3, 15)
     state[1, 7], state[2, 0] = -20 * AT_REST, 5.0
     goal = torch.tensor([[0.0, 0.0, 0.03], [0.0, 0.0, 0.2], [0.0, 0.0, 0.047]])
-    groups = trapper_fitting().groups(Arrivals(state, goal, torch.tensor([29, 30, -1]), torch.arange(3)))
+    run = torch.arange(3)
+    groups = trapper_fitting().groups(Arrivals(state, goal, torch.tensor([29, 30, -1]), run, run))
     assert groups["on table"].tolist() == [True, False, True]
     assert groups["above table"].tolist() == [False, True, False]
     assert groups["at rest"].tolist() == [True, False, True]

@@ -11,7 +11,7 @@ from torch import Tensor
 from torchdyn_plan import keys
 from torchdyn_plan.envs.arm_runner import ArmRunner
 from torchdyn_plan.envs.trapper.contact import is_reached
-from torchdyn_plan.envs.trapper.scene import TrapperScene
+from torchdyn_plan.envs.trapper.scene import TrapperScene, trapper_scene
 from torchdyn_plan.envs.trapper.simulation import TrapperSimulation
 from torchdyn_plan.errors import InputError
 from torchdyn_plan.kinematics.arm import Arm
@@ -30,7 +30,7 @@ class TrapperArmRunner(ArmRunner):
     ) -> None:
         """Build the batch with every arm at home and at rest; ``num_threads`` 0 means all cores."""
         super().__init__(planner, num_envs)
-        self.scene = scene or TrapperScene()
+        self.scene = trapper_scene(scene)
         self.simulation = TrapperSimulation(num_envs, self.scene, num_threads=num_threads)
         self._arm = Arm.ur5(tool_length=self.scene.tool_length)
         self._base = torch.tensor(self.scene.base_pos)

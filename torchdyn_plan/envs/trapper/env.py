@@ -15,13 +15,15 @@ from torchdyn_plan.envs.painter import Painter, Sphere
 from torchdyn_plan.envs.trapper.contact import is_covered, is_pocketed
 from torchdyn_plan.envs.trapper.keys import POCKETED, TRAPPED
 from torchdyn_plan.envs.trapper.reward import GoalReward, goal_reward
-from torchdyn_plan.envs.trapper.scene import TrapperScene
+from torchdyn_plan.envs.trapper.scene import TrapperScene, trapper_scene
 from torchdyn_plan.envs.trapper.simulation import TrapperSimulation
 from torchdyn_plan.envs.trapper.starts import draw_starts
 from torchdyn_plan.kinematics.arm import Arm
 
-HOLD_STEPS = 10
+HOLD_STEPS = 50
 """Control steps for which a ball must stay covered to count as trapped."""
+LAST_HOLD_STEPS = 10
+"""The same at the end of an episode, when there is no time for more."""
 MAX_STEPS = 500
 """Control steps of an episode: two seconds."""
 
@@ -32,10 +34,11 @@ ROWS = 64
 class TrapperEnv(MovingTargetEnv):
     """N independent Trapper episodes, ``batch_size [num_envs]``; keys as in `torchdyn_plan.keys`.
 
-    An episode is `terminated` when the ball is trapped (covered, and kept for `HOLD_STEPS` steps) or pocketed, and
-    `truncated` after ``max_steps`` control steps. The reward is 1 in the step that traps the ball and 0 elsewhere.
-    With ``static_target`` it is the paper's `goal_reward`, and the step that traps the ball brings all that the box
-    would earn there until the end, so that an episode which ends early loses nothing.
+    An episode is `terminated` when the ball is trapped (covered for `HOLD_STEPS` steps on end, or for the last
+    `LAST_HOLD_STEPS` of the episode) or pocketed, and `truncated` after ``max_steps`` control steps. The reward is 1 in
+    the step that traps the ball and 0 elsewhere. With ``static_target`` it is the paper's `goal_reward`, and the step
+    that traps the ball brings all that the box would earn there until the end, so that an episode which ends early
+    loses nothing.
     Episode i starts as a pure function of (split, seed, i): environments take the next index when they reset, so that
     the same actions give bit-identical episodes whatever ``num_envs`` and ``num_threads``.
     """
@@ -51,7 +54,7 @@ class TrapperEnv(MovingTargetEnv):
         static_target: bool = False,
         seed: int | None = None,
         split: str = "train",
-        scene: TrapperScene | None = None,
+        scene: TrapperScene | str | None = None,
         history: int = 24,
         max_steps: int = MAX_STEPS,
         weights: GoalReward | None = None,
@@ -70,7 +73,7 @@ class TrapperEnv(MovingTargetEnv):
             static_target: the ball lies still, and `goal` is where it lies.
             seed: which series of episodes; None for another place in series 0 at every call.
             split: ``train``, ``dev`` or ``test``: series that never share an episode.
-            scene: geometry and physics; the calibrated scene by default.
+            scene: geometry and physics, or the name of a scene; that with a real UR5's limits by default.
             history: length H of `target_history`, in control steps.
             max_steps: control steps after which an episode is truncated.
             weights: of the terms of the reward with ``static_target``.
@@ -100,7 +103,7 @@ class TrapperEnv(MovingTargetEnv):
             on_bad_action=on_bad_action,
             device=device,
         )
-        self.scene, self.weights = scene or TrapperScene(), weights or GoalReward()
+        self.scene, self.weights = trapper_scene(scene), weights or GoalReward()
         self.scene_digest = self.scene.digest()
         self.velocity, self.friction = 0.0 if static_target else velocity, friction
         self.simulation = TrapperSimulation(num_envs, self.scene, friction=friction, num_threads=num_threads)
@@ -111,6 +114,7 @@ class TrapperEnv(MovingTargetEnv):
         self._tool_pos, self._tool_rotation = self._tool(home.expand(num_envs, -1))
         self._home_tool = self._tool_pos[0].clone(), self._tool_rotation[0].clone()
         self._painter: Painter | None = None
+        self._twin: TrapperSimulation | None = None
 
     def _start(self, rows: Tensor, episodes: Tensor) -> Tensor:
         place, speed = draw_starts(self.scene, episodes, velocity=self.velocity, split=self.split, seed=self.seed)
@@ -148,7 +152,20 @@ class TrapperEnv(MovingTargetEnv):
         return RobotReading(self._tool_pos, state, joint_pos, joint_vel)
 
     def _flags(self) -> dict[str, Tensor]:
-        return {TRAPPED: self._held >= HOLD_STEPS, POCKETED: is_pocketed(self.scene, self._trace[:, -1])}
+        enough = torch.where(self._steps < self.max_steps, HOLD_STEPS, LAST_HOLD_STEPS)
+        return {TRAPPED: self._held >= enough, POCKETED: is_pocketed(self.scene, self._trace[:, -1])}
+
+    def true_future(self, rows: Tensor, steps: int) -> Tensor:
+        """As `MovingTargetEnv.true_future`: arm and box stand still from now on, and the ball may bounce off them."""
+        if self._twin is None:
+            threads = self.simulation.num_threads
+            self._twin = TrapperSimulation(self.num_envs, self.scene, friction=self.friction, num_threads=threads)
+        twin, path = self._twin, torch.empty(len(rows), steps, 3)
+        twin.hold(self.simulation, rows)
+        for step in range(steps):
+            twin.step(rows=rows)
+            path[:, step] = twin.ball_pos[rows]
+        return path
 
     def _picture(self, row: int, width: int, height: int) -> np.ndarray[Any, Any]:
         if self._painter is None:

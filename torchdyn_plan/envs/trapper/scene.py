@@ -10,18 +10,23 @@ from dataclasses import dataclass
 
 import mujoco
 
-from torchdyn_plan.checks import check_number
+from torchdyn_plan.checks import check_choice, check_number
 from torchdyn_plan.envs.trapper.bodies import add_arm, add_ball, add_look, add_table
 from torchdyn_plan.errors import InputError
-from torchdyn_plan.kinematics.ur5 import UR5_LINKS
+from torchdyn_plan.kinematics.ur5 import UR5_LINKS, UR5_SPEED_LIMIT
 
 GRAVITY = 9.81
 """[m/s²]"""
+_LATER = ("arm_speed",)
+"""Numbers of a scene that were added later."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class TrapperScene:
-    """Geometry and physics of Trapper. Frame: z up, table surface at z = 0, table centre at the origin, arm at -y."""
+    """Geometry and physics of Trapper; by default with the limits of a real UR5.
+
+    Frame: z up, table surface at z = 0, table centre at the origin, arm at -y.
+    """
 
     table_side: float = 1.59
     """Side of the square playing area, from cushion to cushion [m]."""
@@ -69,6 +74,8 @@ class TrapperScene:
     """Greatest change of a commanded joint speed [rad/s²]."""
     servo_speed: float = 0.95
     """Greatest speed that a servo strives for, as a share of the joint's limit; the other joints add to it."""
+    arm_speed: float = 1.0
+    """Greatest speed of the joints, as a multiple of the real UR5's."""
     substep: float = 0.002
     """Physics step [s]."""
     control_step: float = 0.004
@@ -85,6 +92,11 @@ class TrapperScene:
                 raise InputError(f"{field.name} must be a tuple of {len(UR5_LINKS)} numbers, got {value!r}")
             for number in value:
                 check_number(field.name, number, minimum=minimum)
+
+    @property
+    def joint_speed(self) -> float:
+        """Greatest speed of each joint [rad/s]: an action of ±1."""
+        return self.arm_speed * UR5_SPEED_LIMIT
 
     @property
     def half_side(self) -> float:
@@ -113,7 +125,12 @@ class TrapperScene:
 
     def digest(self) -> str:
         """Hash of every number above: two scenes with one digest are one scene."""
-        text = json.dumps(dataclasses.asdict(self), sort_keys=True)
+        numbers = dataclasses.asdict(self)
+        for name in _LATER:
+            # Scenes that are older than this number keep their digest, and so all that belongs to them.
+            if numbers[name] == getattr(TrapperScene, name):
+                del numbers[name]
+        text = json.dumps(numbers, sort_keys=True)
         return hashlib.sha256(text.encode()).hexdigest()[:16]
 
     def spec(self, *, arm: bool = True) -> mujoco.MjSpec:
@@ -140,3 +157,21 @@ class TrapperScene:
         first = int(model.jnt_dofadr[model.joint("ball").id])
         model.dof_frictionloss[first : first + 2] = friction
         return model
+
+
+SCENES = {"ur5": TrapperScene(), "paper": TrapperScene(arm_speed=2.0)}
+"""Scenes by name: with the limits of a real UR5, and one in which the paper's planner comes near its figures."""
+
+
+def trapper_scene(scene: TrapperScene | str | None = None) -> TrapperScene:
+    """The scene of that name, the first one for None; a scene is returned as it is.
+
+    Raises:
+        InputError: there is no scene of that name; the message lists those there are.
+    """
+    if isinstance(scene, TrapperScene):
+        return scene
+    if scene is None:
+        return next(iter(SCENES.values()))
+    check_choice("scene", scene, SCENES)
+    return SCENES[scene]

@@ -1,12 +1,14 @@
 """N copies of a Trapper scene stepped on native threads, seen as torch tensors that share the simulation's memory."""
 
+from __future__ import annotations
+
 import numpy as np
 import torch
 from mujoco.batch import Batch
 from torch import Tensor
 
 from torchdyn_plan.envs.trapper.scene import TrapperScene
-from torchdyn_plan.kinematics.ur5 import UR5_LINKS, UR5_SPEED_LIMIT
+from torchdyn_plan.kinematics.ur5 import UR5_LINKS
 
 
 class TrapperSimulation:
@@ -24,7 +26,7 @@ class TrapperSimulation:
         self, num_envs: int, scene: TrapperScene, *, friction: float = 0.0, num_threads: int = 0, arm: bool = True
     ) -> None:
         """Compile ``scene`` and build the batch; ``num_threads`` 0 means all cores, ``arm`` False the ball alone."""
-        self.scene, self.num_envs = scene, num_envs
+        self.scene, self.num_envs, self.num_threads = scene, num_envs, num_threads
         self.model = scene.compile(arm=arm, friction=friction)
         self.batch = Batch(self.model, num_envs, num_threads, True)
         self.substeps = round(scene.control_step / scene.substep)
@@ -65,6 +67,13 @@ class TrapperSimulation:
         self.joint_pos[:], self.joint_vel[:] = joint_pos, joint_vel
         self._command[:], self._speed[:] = joint_pos, joint_vel
 
+    def hold(self, other: TrapperSimulation, rows: Tensor) -> None:
+        """Take over ``rows`` (M,) of another simulation of the same scene, with arms that stand still from now on."""
+        self.qpos[rows], self._qvel[rows] = other.qpos[rows], other._qvel[rows]
+        self.joint_vel[rows] = 0.0
+        self._command[rows], self._speed[rows] = self.joint_pos[rows], 0.0
+        self._ctrl[rows] = self.joint_pos[rows]
+
     def step(self, action: Tensor | None = None, rows: Tensor | None = None) -> None:
         """One control step of ``rows`` (all by default); ``action`` (N, 6) is joint speed over its limit, -1 to 1."""
         if action is not None:
@@ -72,8 +81,8 @@ class TrapperSimulation:
         self.batch.step(None if rows is None else rows.numpy(), nstep=self.substeps)
 
     def _drive(self, action: Tensor) -> None:
-        fastest = self.scene.servo_speed * UR5_SPEED_LIMIT
-        wanted = (action.to(torch.float64) * UR5_SPEED_LIMIT).clamp(-fastest, fastest)
+        fastest = self.scene.servo_speed * self.scene.joint_speed
+        wanted = (action.to(torch.float64) * self.scene.joint_speed).clamp(-fastest, fastest)
         change = self.scene.acceleration_limit * self.scene.control_step
         speed = torch.clamp(wanted, self._speed - change, self._speed + change, out=self._speed)
         position = self.joint_pos

@@ -10,7 +10,7 @@ from torchdyn_plan.evaluation.episodes import EpisodeLog
 from torchdyn_plan.evaluation.results import NO_CAUSE
 from torchdyn_plan.tasks.task import Truth, Verdict
 from torchdyn_plan.tasks.trapper.evidence import Evidence, find_evidence
-from torchdyn_plan.tasks.trapper.task import TASK
+from torchdyn_plan.tasks.trapper.task import CAUSES
 
 FORECAST_TOLERANCE = 0.04
 """A ball that comes no nearer than this to the promised place about the promised time is elsewhere [m]."""
@@ -18,9 +18,9 @@ ETA_TOLERANCE = 5
 """An arm that comes later than promised by more than this is late: a bin of the arrival predictor [control steps]."""
 
 
-def judge_episodes(log: EpisodeLog, truth: Truth) -> Verdict:
+def judge_episodes(log: EpisodeLog, truth: Truth, scene: TrapperScene) -> Verdict:
     """Why the episodes of ``log`` failed, what their records say of it, and whether the ball was ``touched``."""
-    scene, evidence = TrapperScene(), Evidence.none(len(log.done))
+    evidence = Evidence.none(len(log.done))
     for episodes, trace in log.records():
         for whole, part in zip(evidence, find_evidence(scene, trace, truth.future[episodes]), strict=True):
             whole[episodes] = part
@@ -57,5 +57,5 @@ def failure_cause(trapped: Tensor, solvable: Tensor, touched: Tensor, pocketed: 
         "pocketed": pocketed & ~touched & ~evidence.promised,
         "late": torch.ones_like(trapped),
     }
-    in_order = torch.stack([holds[cause] for cause in TASK.causes], dim=-1)
+    in_order = torch.stack([holds[cause] for cause in CAUSES], dim=-1)
     return torch.where(trapped, NO_CAUSE, in_order.to(torch.int64).argmax(dim=-1))

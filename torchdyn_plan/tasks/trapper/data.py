@@ -9,7 +9,7 @@ from torch import Tensor
 
 from torchdyn_plan.envs.trapper.arm_runner import TrapperArmRunner
 from torchdyn_plan.envs.trapper.contact import is_pocketed
-from torchdyn_plan.envs.trapper.scene import TrapperScene
+from torchdyn_plan.envs.trapper.scene import TrapperScene, trapper_scene
 from torchdyn_plan.envs.trapper.starts import draw_starts
 from torchdyn_plan.nets.eta import ETAConfig
 from torchdyn_plan.nets.forecaster import ForecasterConfig
@@ -41,7 +41,7 @@ PRESENTS = (40, 100, 200)
 
 
 def record_rolls(
-    blocks: Sequence[Tensor], *, seed: int, num_threads: int = 0, scene: TrapperScene | None = None
+    blocks: Sequence[Tensor], *, seed: int, num_threads: int = 0, scene: TrapperScene | str | None = None
 ) -> dict[str, Tensor]:
     """Balls rolled alone (the arm at home touches none), each at a velocity of its own up to `FASTEST`.
 
@@ -49,12 +49,12 @@ def record_rolls(
         blocks: numbers of the episodes of the split ``train``, those that roll side by side in one tensor each.
         seed: which series of episodes.
         num_threads: of the simulation, 0 for all cores.
-        scene: that the balls roll in; the calibrated scene by default.
+        scene: that the balls roll in, or its name; that with a real UR5's limits by default.
 
     Returns:
         What `lay_end_to_end` does.
     """
-    scene, paths, speeds = scene or TrapperScene(), [], []
+    scene, paths, speeds = trapper_scene(scene), [], []
     for episodes in blocks:
         place, direction = draw_starts(scene, episodes, velocity=1.0, split="train", seed=seed)
         draw = torch.Generator().manual_seed(seed * SERIES + int(episodes[0]))
@@ -73,10 +73,10 @@ def record_arm_runs(
     sequences: int,
     seed: int,
     num_threads: int = 0,
-    scene: TrapperScene | None = None,
+    scene: TrapperScene | str | None = None,
 ) -> dict[str, Tensor]:
     """Runs of ``planner``: ``sequences`` times one sequence of each of ``num_envs`` arms, as `record_runs` returns."""
-    scene = scene or TrapperScene()
+    scene = trapper_scene(scene)
     runner = TrapperArmRunner(planner, num_envs, scene=scene, num_threads=num_threads)
     comes_to_rest = not isinstance(planner, StaticPlannerModule) or planner.comes_to_rest
     return record_runs(runner, run_plan(scene, comes_to_rest=comes_to_rest), sequences=sequences, seed=seed)
@@ -110,9 +110,9 @@ def draw_goals(scene: TrapperScene, count: int, draw: torch.Generator) -> Tensor
     return torch.cat([place, z.unsqueeze(-1)], dim=-1)
 
 
-def trapper_fitting(scene: TrapperScene | None = None) -> Fitting:
-    """Sizes of the networks for the ball and the UR5 of ``scene``, and how they are scored."""
-    scene = scene or TrapperScene()
+def trapper_fitting(scene: TrapperScene | str | None = None) -> Fitting:
+    """Sizes of the networks for the ball and the UR5 of ``scene``, or of that name, and how they are scored."""
+    scene = trapper_scene(scene)
 
     def groups(held: Arrivals) -> dict[str, Tensor]:
         rest = held.robot_state[:, 6:12].abs().amax(-1) < AT_REST

@@ -10,11 +10,14 @@ from torch import Tensor
 
 from torchdyn_plan.checks import check_trailing_shape
 from torchdyn_plan.envs.trapper.arm_runner import TrapperArmRunner
-from torchdyn_plan.envs.trapper.scene import TrapperScene
+from torchdyn_plan.envs.trapper.scene import TrapperScene, trapper_scene
 from torchdyn_plan.nets.arrival import Arrival, ArrivalModel
+from torchdyn_plan.training.runs import first_as_near
 
 LONGEST = 300
 """Control steps after which an arm that has not arrived never does."""
+AT_REST, STARTING = 0.05, 15
+"""An arm whose joints are slower than this, after so many control steps, comes no nearer [rad/s]."""
 
 
 class MeasuredArrival(ArrivalModel):
@@ -24,12 +27,17 @@ class MeasuredArrival(ArrivalModel):
         self,
         static: Callable[[TensorDictBase], TensorDictBase],
         *,
-        scene: TrapperScene | None = None,
+        scene: TrapperScene | str | None = None,
+        nearest: bool = False,
         num_threads: int = 0,
     ) -> None:
-        """Measure arrivals of ``static`` in ``scene``."""
+        """Measure arrivals of ``static`` in ``scene``.
+
+        With ``nearest`` none is *never*: the time to a place out of reach is that until the arm is as near as it comes.
+        """
         super().__init__()
-        self.static, self.scene, self.num_threads = static, scene or TrapperScene(), num_threads
+        self.nearest = nearest
+        self.static, self.scene, self.num_threads = static, trapper_scene(scene), num_threads
         self._arms: dict[int, TrapperArmRunner] = {}
 
     def arrival(self, robot_state: Tensor, goal: Tensor, *, estimator: str = "mode") -> Arrival:
@@ -49,10 +57,15 @@ class MeasuredArrival(ArrivalModel):
             self._arms[count] = driven
         arms = self._arms[count]
         arms.reset(state[:, :6], state[:, 6:12])
-        arrived = torch.full((count,), LONGEST + 1)
+        arrived, tools = torch.full((count,), LONGEST + 1), []
         for step in range(LONGEST + 1):
             arrived = torch.where((arrived > LONGEST) & arms.is_reached(goal), step, arrived)
-            if bool((arrived <= LONGEST).all()):
+            tools.append(arms.tool_pos)
+            resting = (arms.robot_state[:, 6:12].abs() < AT_REST).all(-1) & (step > STARTING)
+            if bool(((arrived <= LONGEST) | (resting & self.nearest)).all()):
                 break
             arms.step(goal)
-        return arrived
+        if not self.nearest:
+            return arrived
+        nearest = first_as_near(torch.stack(tools), goal)
+        return torch.where(arrived <= LONGEST, arrived, nearest)

@@ -14,7 +14,7 @@ from torchdyn_plan.envs.trapper.env import TrapperEnv
 from torchdyn_plan.envs.trapper.goal_env import TrapperGoalEnv
 from torchdyn_plan.envs.trapper.keys import TOOL_ROTATION
 from torchdyn_plan.envs.trapper.reward import GoalReward, goal_reward
-from torchdyn_plan.envs.trapper.scene import TrapperScene
+from torchdyn_plan.envs.trapper.scene import TrapperScene, trapper_scene
 from torchdyn_plan.envs.trapper.starts import draw_starts
 from torchdyn_plan.evaluation.episodes import EpisodeLog, play_all
 from torchdyn_plan.nets.policy import Actor, PolicyConfig
@@ -54,7 +54,7 @@ class TrapperGoalTask(GoalTask):
         *,
         period: int = 5,
         weights: GoalReward | None = None,
-        scene: TrapperScene | None = None,
+        scene: TrapperScene | str | None = None,
         config: PolicyConfig | None = None,
         episodes: int = 400,
         num_threads: int = 0,
@@ -64,12 +64,12 @@ class TrapperGoalTask(GoalTask):
         Args:
             period: control steps for which an action holds.
             weights: of the reward's terms.
-            scene: that the arm stands in.
+            scene: that the arm stands in, or its name.
             config: of the networks.
             episodes: balls of the split ``dev`` that the policy is scored on; those out of reach do not count.
             num_threads: of the simulation, 0 for all cores.
         """
-        self.period, self.weights, self.scene = period, weights or GoalReward(), scene or TrapperScene()
+        self.period, self.weights, self.scene = period, weights or GoalReward(), trapper_scene(scene)
         self.policy_config, self.episodes, self.num_threads = config or PolicyConfig(), episodes, num_threads
         self.length = round(SECONDS / (period * self.scene.control_step))
         self._reachable: Tensor | None = None

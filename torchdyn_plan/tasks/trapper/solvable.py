@@ -15,14 +15,14 @@ from torch import Tensor
 
 from torchdyn_plan.envs.trapper.arm_runner import TrapperArmRunner
 from torchdyn_plan.envs.trapper.contact import is_pocketed
-from torchdyn_plan.envs.trapper.scene import TrapperScene
+from torchdyn_plan.envs.trapper.scene import TrapperScene, trapper_scene
 from torchdyn_plan.envs.trapper.simulation import TrapperSimulation
 from torchdyn_plan.envs.trapper.starts import draw_starts
 from torchdyn_plan.errors import OutputError, WeightsError
 from torchdyn_plan.files import read_tensors, write_tensors
 from torchdyn_plan.progress import progress_bar
 from torchdyn_plan.tasks.task import Truth
-from torchdyn_plan.tasks.trapper.task import TASK
+from torchdyn_plan.tasks.trapper.task import trapper_task
 
 HORIZON = 300
 """Control steps that the recorded truth goes on after the end of an episode."""
@@ -55,26 +55,35 @@ class ArrivalMap(NamedTuple):
 
 
 def record_truth(
-    velocity: float, friction: float, *, episodes: int, seed: int, split: str, static: str, num_threads: int = 0
+    velocity: float,
+    friction: float,
+    *,
+    scene: TrapperScene | str,
+    episodes: int,
+    seed: int,
+    split: str,
+    static: str,
+    num_threads: int = 0,
 ) -> Truth:
     """Where the balls of episodes 0 … E-1 roll, and which of them the arm can be at in time.
 
     Args:
         velocity: of the balls at the start [m/s].
         friction: their friction loss [N].
+        scene: that they roll in, or its name.
         episodes: number E of episodes.
         seed: which series of episodes.
         split: which family of series.
         static: name of the static planner that drives the arm.
         num_threads: of the simulation, 0 for all cores.
     """
-    scene = TrapperScene()
-    driver = TASK.static_planner(static, chunk=TASK.rows_at_once[1])
-    arrivals = arrival_map(static, driver, scene, num_threads=num_threads)
-    place, speed = draw_starts(scene, torch.arange(episodes), velocity=velocity, split=split, seed=seed)
-    steps = TASK.max_steps + HORIZON
-    path = record_path(scene, place, speed, steps=steps, friction=friction, num_threads=num_threads)
-    return Truth(path, is_solvable(arrivals, scene, path[:, : TASK.max_steps + 1]))
+    task, room = trapper_task(scene), trapper_scene(scene)
+    driver = task.static_planner(static, chunk=task.rows_at_once[1])
+    arrivals = arrival_map(static, driver, room, num_threads=num_threads)
+    place, speed = draw_starts(room, torch.arange(episodes), velocity=velocity, split=split, seed=seed)
+    steps = task.max_steps + HORIZON
+    path = record_path(room, place, speed, steps=steps, friction=friction, num_threads=num_threads)
+    return Truth(path, is_solvable(arrivals, room, path[:, : task.max_steps + 1]))
 
 
 def is_solvable(arrivals: ArrivalMap, scene: TrapperScene, path: Tensor) -> Tensor:
@@ -107,10 +116,14 @@ def record_path(
 
 
 def measure_arrivals(
-    planner: Callable[[TensorDictBase], TensorDictBase], scene: TrapperScene, *, num_threads: int = 0
+    planner: Callable[[TensorDictBase], TensorDictBase],
+    scene: TrapperScene,
+    *,
+    spacing: float = SPACING,
+    num_threads: int = 0,
 ) -> ArrivalMap:
-    """Run ``planner`` from home to every point of a grid over the table, and look when it is there."""
-    count = int(-(-scene.table_side // SPACING)) + 1
+    """Run ``planner`` from home to each point of a grid over the table, ``spacing`` [m] apart, until it is there."""
+    count = int(-(-scene.table_side // spacing)) + 1
     line = torch.linspace(-scene.half_side, scene.half_side, count)
     grid = torch.cartesian_prod(line, line)
     goals = torch.cat([grid, torch.full((len(grid), 1), scene.ball_radius)], dim=-1)
