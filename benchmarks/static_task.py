@@ -1,4 +1,4 @@
-"""The static task: how many of the balls that lie still, and that the arm can cover at all, the static planner traps.
+"""The static task: how many of the balls that lie still, and that the arm can cover, the static planner traps.
 
 python benchmarks/static_task.py --out benchmarks/results/static_task.json
 """
@@ -11,10 +11,10 @@ import torch
 import tyro
 from study import Episodes, Row, Setting, Study, measuring, rate_entries
 
-from torchdyn_plan.envs import TrapperScene
+from torchdyn_plan.envs.trapper.scene import trapper_scene
 from torchdyn_plan.envs.trapper.starts import draw_starts
 from torchdyn_plan.tasks import load_task
-from torchdyn_plan.tasks.trapper.workspace import is_reachable
+from torchdyn_plan.tasks.trapper.workspace import is_coverable, is_reachable
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -23,26 +23,34 @@ class Arguments(Episodes):
 
     static: str = "ik"
     """Static planner: ik or rl."""
+    scene: str = "ur5"
+    """Scene: ur5 or paper."""
     episodes: int = 1000
     split: str = "test"
     num_envs: int = 256
 
 
 def row_of(setting: Setting) -> Row:
-    """How many of the balls within reach are trapped, and where those lie that are not."""
-    arguments = setting.arguments
+    """How many of the balls that can be covered are trapped, and where those lie that are not."""
+    arguments, scene = setting.arguments, trapper_scene(setting.task.scene)
     episodes = torch.arange(arguments.episodes)
-    place, _ = draw_starts(TrapperScene(), episodes, velocity=0.0, split=arguments.split, seed=arguments.seed)
-    reachable = is_reachable(TrapperScene(), place)
+    place, _ = draw_starts(scene, episodes, velocity=0.0, split=arguments.split, seed=arguments.seed)
+    groups = {"coverable": is_coverable(scene, place), "reachable": is_reachable(scene, place)}
     trapped = setting.play(setting.planner("pursuit"), "pursuit").success
-    share = rate_entries("success", int((trapped & reachable).sum()), int(reachable.sum()))
-    missed = [[round(value, 3) for value in ball] for ball in place[reachable & ~trapped].tolist()]
-    return {"reachable": int(reachable.sum()), **share, "not_trapped": missed}
+    row: Row = {"trapped_of_all": int(trapped.sum()), "solvable": int(setting.solvable.sum())}
+    for name, group in groups.items():
+        row |= {name: int(group.sum())}
+        row |= rate_entries(f"success_{name}", int((trapped & group).sum()), int(group.sum()))
+    missed = place[groups["coverable"] & ~trapped]
+    beyond = place[trapped & ~groups["coverable"]]
+    for name, balls in (("not_trapped", missed), ("trapped_beyond", beyond)):
+        row[name] = [[round(value, 3) for value in ball] for ball in balls.tolist()]
+    return row
 
 
 def main(arguments: Arguments) -> None:
     """Run, save and print."""
-    task = load_task("trapper")
+    task = load_task("trapper", arguments.scene)
     study = Study(arguments, scene=task.digest())
     setting = Setting(task, arguments, static=arguments.static, velocity=0.0)
     with measuring():

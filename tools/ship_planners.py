@@ -11,6 +11,7 @@ from typing import Any
 
 from torchdyn_plan.files import write_json
 from torchdyn_plan.nets import ETANetwork
+from torchdyn_plan.nets.policy import Actor
 from torchdyn_plan.nets.pretrained import SHIPPED, Pretrained
 from torchdyn_plan.planners.pretrained import describe_planner
 from torchdyn_plan.tasks import Task, load_task
@@ -27,7 +28,7 @@ def shipped_planners() -> dict[str, dict[str, Any]]:
             for planner, ending in NAMES.items():
                 if planner in task.planners:
                     name = f"{task.weights_name}-{static}"
-                    file_of = partial(weights_file, task.weights_name, name)
+                    file_of = partial(weights_file, task, name)
                     found[f"{name}{ending}"] = describe_planner(task.planner(planner, static), file_of)
     return found
 
@@ -38,11 +39,12 @@ def tasks() -> Iterator[Task]:
         yield from [task.in_scene(scene) for scene in task.scenes] or [task]
 
 
-def weights_file(shared: str, own: str, network: Pretrained) -> str:
-    """File of ``network``, called after its task, or after the static planner, too, if it is the static planner's."""
-    if not isinstance(network, ETANetwork):
-        return f"{network.kind}-{shared}.safetensors"
-    return f"{network.kind}-{own}{'' if network.config.never else '-nearest'}.safetensors"
+def weights_file(task: Task, own: str, network: Pretrained) -> str:
+    """File of ``network`` of a planner of ``task``; arrival times are those of the static planner, ``own``."""
+    if isinstance(network, ETANetwork):
+        return f"{network.kind}-{own}{'' if network.config.never else '-nearest'}.safetensors"
+    shared = task.weights_name if isinstance(network, Actor) else task.path_weights or task.weights_name
+    return f"{network.kind}-{shared}.safetensors"
 
 
 def main(folder: Path = SHIPPED) -> None:

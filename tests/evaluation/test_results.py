@@ -1,6 +1,7 @@
 import dataclasses
 import json
 import math
+import statistics
 
 import pytest
 import torch
@@ -8,7 +9,7 @@ import torch
 from torchdyn_plan.errors import InputError
 from torchdyn_plan.evaluation.plots import plot_results, plot_sweep
 from torchdyn_plan.evaluation.report import format_table
-from torchdyn_plan.evaluation.results import NO_CAUSE, EpisodeOutcomes, failure_shares, summarize
+from torchdyn_plan.evaluation.results import NO_CAUSE, EpisodeOutcomes, failure_shares, over_repeats, summarize
 from torchdyn_plan.tasks.trapper.task import TASK, TrapperSettings
 
 CAUSES = TASK.causes
@@ -134,3 +135,17 @@ def test_a_setting_nobody_could_solve_leaves_a_gap(tmp_path):
     assert "–" in format_table(TASK, rows)
     plot_sweep(TASK, rows, "velocity", tmp_path / "sweep.png")
     plot_results(TASK, rows, tmp_path / "results.png")
+
+
+def test_a_row_tells_how_its_repeats_differ_as_the_paper_does():
+    parts = [outcomes(40, seed) for seed in range(3)]
+    row = summarize(EpisodeOutcomes.merge(parts), task=TASK, planner="corner", static="ik", settings=TASK.settings())
+    assert (row.repeats, row.success_repeats) == (1, None)
+    told = over_repeats(row, parts)
+    rates = [float(part.success.double().mean()) for part in parts]
+    assert told.repeats == 3
+    assert told.success_repeats == pytest.approx((statistics.mean(rates), statistics.stdev(rates)))
+    assert told.success_repeats[0] == pytest.approx(row.success)
+    hopeless = dataclasses.replace(parts[0], solvable=torch.zeros(40, dtype=torch.bool))
+    assert over_repeats(row, [hopeless, *parts[1:]]).success_solvable_repeats is None
+    assert over_repeats(row, parts[:1]).success_repeats is None

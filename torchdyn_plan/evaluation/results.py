@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import dataclasses
+import math
+import statistics
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -167,6 +169,12 @@ class ResultRow:
     """The paper's success rate over all episodes at this setting; None where it has none."""
     paper_success_solvable: float | None
     """The paper's success rate over solvable episodes at this setting; None where it has none."""
+    repeats: int = 1
+    """Series of episodes that the row is over."""
+    success_repeats: tuple[float, float] | None = None
+    """Mean and standard deviation of ``success`` over the repeats of a sweep, as the paper reports; None for one."""
+    success_solvable_repeats: tuple[float, float] | None = None
+    """The same of ``success_solvable``; None also where a repeat has no solvable episode."""
 
 
 def failure_shares(outcomes: EpisodeOutcomes) -> dict[str, float]:
@@ -209,6 +217,25 @@ def _paper_rates(task: Task, planner: str, static: str, settings: Settings) -> t
     paper = task.paper()
     everything = paper.rate(planner, static, settings, solvable=False)
     return everything, paper.rate(planner, static, settings, solvable=True)
+
+
+def over_repeats(row: ResultRow, repeats: Sequence[EpisodeOutcomes]) -> ResultRow:
+    """``row``, that is over all of the ``repeats``, with mean and standard deviation over them."""
+
+    def spread(rates: Sequence[float]) -> tuple[float, float] | None:
+        if len(rates) < 2 or not all(math.isfinite(one) for one in rates):
+            return None
+        return statistics.mean(rates), statistics.stdev(rates)
+
+    everything = [float(one.success.double().mean()) for one in repeats]
+    # Without a solvable episode the mean is no number.
+    possible = [float(one.success[one.solvable].double().mean()) for one in repeats]
+    return dataclasses.replace(
+        row,
+        repeats=len(repeats),
+        success_repeats=spread(everything),
+        success_solvable_repeats=spread(possible),
+    )
 
 
 def write_results(

@@ -19,7 +19,7 @@ from torchdyn_plan.evaluation.identity import (
     identity_of,
 )
 from torchdyn_plan.evaluation.plots import plot_sweep
-from torchdyn_plan.evaluation.results import EpisodeOutcomes, ResultRow, write_results
+from torchdyn_plan.evaluation.results import EpisodeOutcomes, ResultRow, over_repeats, write_results
 from torchdyn_plan.evaluation.study import Planners, Study
 from torchdyn_plan.files import check_writable_folder, exists, read_json, short_path, write_json
 from torchdyn_plan.planners import Delivery
@@ -193,7 +193,8 @@ class _Sweep:
         """A row for each planner at ``value``, over all repeats."""
         repeats = [self._read_point(value, repeat) for repeat in range(self.repeats)]
         merged = {name: EpisodeOutcomes.merge([point[name] for point in repeats]) for name in self.study.planners}
-        return self.study.summarize(self.points[value], merged)
+        rows = self.study.summarize(self.points[value], merged)
+        return [over_repeats(row, [point[row.planner] for point in repeats]) for row in rows]
 
     def _read_point(self, value: float, repeat: int) -> dict[str, EpisodeOutcomes]:
         """Outcomes by planner; raises `InputError` where the file is damaged, or of another point."""

@@ -164,6 +164,9 @@ class Task:
     """Its scene, by the name in ``scenes`` or itself, if there are several."""
     scenes: Mapping[str, Callable[[], Task]] = field(default_factory=dict)
     """The same task in each of its scenes, by the scene's name; the first is the one that its name alone stands for."""
+    path_weights: str = ""
+    """What the weights that ship of networks of the target's motion are called, if targets move alike in several
+    scenes; `weights_name` if it is empty."""
     rivals: tuple[str, ...] = ()
     """Planners that run only when they are named."""
     rows_at_once: tuple[int, int] = (32, 64)
@@ -283,14 +286,14 @@ class PlannerParts:
         """The `Forecaster`, frozen."""
         from torchdyn_plan.nets import Forecaster
 
-        return self._load(Forecaster, self.task.weights_name)
+        return self._load(Forecaster, self._path_weights)
 
     @property
     def spread_forecaster(self) -> Any:
         """The `Forecaster` with its `SpreadNetwork`, frozen."""
         from torchdyn_plan.nets import SpreadForecaster, SpreadNetwork
 
-        return SpreadForecaster(self.forecaster, self._load(SpreadNetwork, self.task.weights_name)).eval()
+        return SpreadForecaster(self.forecaster, self._load(SpreadNetwork, self._path_weights)).eval()
 
     @property
     def eta(self) -> Any:
@@ -307,6 +310,10 @@ class PlannerParts:
         if self.weights is None:
             return self._load(ETANetwork, f"{self.task.weights_name}-{self.static_name}-nearest")
         return ETANetwork.from_pretrained(self.weights / NEAREST_ETA).requires_grad_(False)
+
+    @property
+    def _path_weights(self) -> str:
+        return self.task.path_weights or self.task.weights_name
 
     def _load(self, kind: Any, name: str) -> Any:
         return kind.from_pretrained(name if self.weights is None else self.weights).requires_grad_(False)

@@ -94,7 +94,7 @@ def train(
         config = dataclasses.replace(fitting.eta, never=network == "eta")
         return fit.fit_eta(task, data, out, recipe, config=config, static=static, resume=resume, name=network)
     beside = out / "forecaster" / "forecaster.safetensors"
-    forecaster = beside if is_file(beside) else task.weights_name
+    forecaster = beside if is_file(beside) else task.path_weights or task.weights_name
     return fit_spread.fit_spread(task, data, out, recipe, forecaster=forecaster, resume=resume)
 
 

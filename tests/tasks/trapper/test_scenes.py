@@ -1,5 +1,7 @@
 """The task in each of its scenes."""
 
+import dataclasses
+
 import pytest
 import torch
 
@@ -29,6 +31,15 @@ def test_all_of_a_task_is_in_its_scene(name):
     static = task.static_planner("ik")
     assert static.arm.speed_limit.tolist() == pytest.approx([scene.joint_speed] * 6)
     assert {task.planner(planner).scene for planner in task.planners} == {scene.digest()}
+
+
+def test_balls_roll_alike_in_all_scenes():
+    of_the_arm = {"arm_speed", "acceleration_limit", "servo_speed", "servo_stiffness", "servo_damping", "home"}
+    of_the_arm |= {"base_setback", "base_height"}
+    first = dataclasses.asdict(SCENES[NAMES[0]])
+    for scene in SCENES.values():
+        changed = {name for name, value in dataclasses.asdict(scene).items() if value != first[name]}
+        assert changed <= of_the_arm
 
 
 def test_weights_carry_the_scene_in_their_names_but_for_the_first():

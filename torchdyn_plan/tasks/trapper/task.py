@@ -251,6 +251,8 @@ def trapper_task(scene: Scene) -> Task:
         control_step=0.004,
         scene=scene,
         scenes={name: partial(trapper_task, name) for name in SCENES},
+        # Only the arm differs from scene to scene.
+        path_weights=NAME,
         make_env=partial(make_env, scene),
         digest=partial(digest, scene),
         static_planners={"ik": partial(ik_planner, scene), "rl": partial(policy_planner, scene)},

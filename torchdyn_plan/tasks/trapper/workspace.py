@@ -1,6 +1,6 @@
 # mujoco hides its names from type checkers.
 # pyright: reportAttributeAccessIssue=false
-"""Which places of the table the arm can cover at all: a question to the scene, whatever a planner can do."""
+"""Which places of the table the arm can cover: a question to the scene, whatever a planner can do."""
 
 from __future__ import annotations
 
@@ -19,6 +19,8 @@ TOLERANCE = 1e-3
 """Error of position [m] and orientation [rad] that counts as a solution."""
 CLEARANCE = 0.001
 """Gap between box and cushion [m]."""
+OFFSETS = (-0.99, 0.0, 0.99)
+"""Places of the box along each axis from which it may cover a ball, as shares of the room that it leaves the ball."""
 DOWN = 0.006
 """Height of the box mouth when it is down [m]."""
 
@@ -38,8 +40,30 @@ def is_reachable(scene: TrapperScene, place: Tensor, *, seed: int = 0) -> Tensor
     Returns:
         ``(M,)`` bool.
     """
+    return _can_stand(scene, place.double(), place, seed)
+
+
+@torch.no_grad()
+def is_coverable(scene: TrapperScene, place: Tensor, *, seed: int = 0) -> Tensor:
+    """Whether a pose as of `is_reachable` exists in which the box covers a ball at ``place``, off its middle or not.
+
+    Beside the middle, `OFFSETS` of what the box leaves the ball to move are tried. Arguments and result as of
+    `is_reachable`: every ball within reach can be covered.
+    """
+    found = is_reachable(scene, place, seed=seed)
+    rest = (~found).nonzero().squeeze(-1)
+    share = torch.tensor(OFFSETS, dtype=torch.float64)
+    offset = torch.cartesian_prod(share, share) * (scene.box_half_width - scene.ball_radius)
+    around = (place[rest].double().unsqueeze(1) + offset).flatten(0, 1)
+    stands = _can_stand(scene, around, place[rest].repeat_interleave(len(offset), 0), seed)
+    found[rest] = stands.view(len(rest), -1).any(-1)
+    return found
+
+
+def _can_stand(scene: TrapperScene, wanted: Tensor, place: Tensor, seed: int) -> Tensor:
+    """Whether the box can stand as near to ``wanted`` (M, 2) as cushions let it, over a ball at ``place``: ``(M,)``."""
     limit = scene.half_side - scene.box_outer - CLEARANCE
-    box = place.double().clamp(-limit, limit)
+    box = wanted.clamp(-limit, limit)
     room = scene.box_half_width - scene.ball_radius
     covered = ((box - place).abs() <= room).all(-1)
     joint_pos, solved = _solve(scene, box, seed)
