@@ -171,11 +171,10 @@ class Arm(Precise):
         Raises:
             InputError: a joint has none.
         """
-        unlimited = [
-            name for name, speed in zip(self.joint_names, self.speed_limit.tolist(), strict=True) if speed == math.inf
-        ]
+        limits = enumerate(zip(self.joint_names, self.speed_limit.tolist(), strict=True))
+        unlimited = [repr(name) if name else f"number {index}" for index, (name, speed) in limits if speed == math.inf]
         if unlimited:
-            names = ", ".join(map(repr, unlimited))
+            names = ", ".join(unlimited)
             raise InputError(
                 f"{owner} needs the speed limits of all joints, and the description gives none for {names}: give the "
                 "arm a speed_limit=, one number for all joints or one for each [rad/s; m/s]"

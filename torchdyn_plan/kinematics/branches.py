@@ -195,6 +195,8 @@ def _universal(joints: list[Joint], tool: Tensor) -> Universal | str:
     """Constants of a chain, or why it is not of the family."""
     if len(joints) != 6 or any(joint.kind != "revolute" for joint in joints):
         return f"it has {len(joints)} joints of kinds {', '.join(joint.kind for joint in joints)}, not 6 that turn"
+    if any(joint.coupling is not None for joint in joints):
+        return "some of its joints move together"
     axes, places, end = _lines(joints, tool)
     for first, second in ((1, 2), (2, 3)):
         if torch.linalg.cross(axes[first], axes[second]).norm() > EXACT:
