@@ -77,7 +77,7 @@ def descend(search: Search, tries: Tensor, rows: Tensor, *, all_tries: bool = Fa
         error = error_at(search, pose, index)
         left = lengths(error)
         now = search.cost(left)
-        nearer = now < cost[here]
+        nearer = (now < cost[here]).nonzero().squeeze(-1)
         better = here[nearer]
         best[better], residual[better], cost[better] = q[nearer], left[nearer], now[nearer]
         going = (now > 1.0) & moving
@@ -86,8 +86,9 @@ def descend(search: Search, tries: Tensor, rows: Tensor, *, all_tries: bool = Fa
             going &= ~ended[here // number]
         if iteration == search.iterations or not bool(going.any()):
             break
-        if not bool(going.all()):
-            here, q, index, jacobian, error = here[going], q[going], index[going], jacobian[going], error[going]
+        kept = going.nonzero().squeeze(-1)
+        if len(kept) < len(here):
+            here, q, index, jacobian, error = (value[kept] for value in (here, q, index, jacobian, error))
         q, moving = stepped(search, q, rows_at(search, jacobian, index), error, index)
     return best.view(count, number, joints), residual.view(count, number, 2)
 
