@@ -109,11 +109,11 @@ def all_branches(  # noqa: PLR0917  # All are needed.
     lower, upper = (limit.reshape(-1, 6).T.unsqueeze(1).contiguous() for limit in (lower, upper))
     start = start.T.contiguous().unsqueeze(1)
     angles, solvable = _angles(form, target, (sign * start + offset)[5, 0])
-    q = turned_towards((angles - offset) * sign, start, lower, upper)
     # Of who is at a limit, rounding alone may lead outside.
     slack, valid = torch.finfo(target.dtype).eps ** SLACK, solvable
-    for column, least, most in zip(q, lower, upper, strict=True):
-        valid = valid & (column >= least - slack) & (column <= most + slack)
+    q = turned_towards((angles - offset) * sign, start, lower - slack, upper + slack)
+    for column, least, most in zip(q, lower - slack, upper + slack, strict=True):
+        valid = valid & (column >= least) & (column <= most)
     q = torch.clamp(q, lower, upper)
     return q.nan_to_num(0.0, 0.0, 0.0).permute(2, 1, 0).contiguous(), valid.T.contiguous()
 
