@@ -9,8 +9,8 @@ positions. ``follow`` is asked as it is, and once more without speed limits, so 
 at every step, from its last answer. With ``--tool``, the tool itself moves by sums of sines, and part of the paths
 cannot be followed.
 
-``jumps`` is the share of paths in which a joint moves by more than 0.8 rad in one step; ``detours`` the share in which a
-joint is more than 0.8 rad on when the target, lost for some steps, is reached again: a jump within the speed limits.
+``jumps`` is the share of paths in which a joint moves by more than 0.8 rad in one step; ``detours`` the share in which
+a joint is more than 0.8 rad on when the target, lost for some steps, is reached again: a jump within speed limits.
 """
 
 from __future__ import annotations
@@ -140,7 +140,9 @@ def followed(arm: Arm, q0: Tensor, poses: Tensor) -> tuple[Tensor, Tensor]:
 def measured(line: str, arguments: Arguments) -> Row:
     """The row of ``arm|how``."""
     name, how = line.split("|")
-    arm = make(name) if how != "follow without speed limits" else Arm(ARMS[name](), speed_limit=1e6, dtype=torch.float64)
+    arm = (
+        make(name) if how != "follow without speed limits" else Arm(ARMS[name](), speed_limit=1e6, dtype=torch.float64)
+    )
     q0, poses = targets(make(name), arguments.paths, arguments.steps, tool=arguments.tool)
     ways: dict[str, Callable[..., Any]] = {"solve_ik": warm_started}
     begin = time.process_time()

@@ -119,7 +119,9 @@ def speed(poses: int, seconds: float) -> Row:
         row["EAIK"] = 1e6 * median(times) / poses
     found = branches(arm, target)
     theirs = [exact(eaik, pose) for pose in target]
-    row["of_theirs_found"] = float(torch.cat([_found(*one) for one in zip(theirs, found.q, found.valid, strict=True)]).mean())
+    row["of_theirs_found"] = float(
+        torch.cat([_found(*one) for one in zip(theirs, found.q, found.valid, strict=True)]).mean()
+    )
     row["solutions"] = float(found.valid.sum(dim=1).double().mean())
     row["solutions, EAIK"] = sum(map(len, theirs)) / poses
     row["max_error"] = float((arm(found.q) - target.unsqueeze(1)).abs().amax(dim=(-2, -1))[found.valid].max())
@@ -141,8 +143,8 @@ def main(arguments: Arguments) -> None:
     study = Study(arguments, resume=False)
     sides = started("nearest.py", arguments.former, "--poses", str(arguments.poses))
     for case in CASES:
-        for how in HOWS:
-            asked = {"now": sides["now"]} if "solutions" in HOWS[how] else sides
+        for how, options in HOWS.items():
+            asked = {"now": sides["now"]} if "solutions" in options else sides
             study.add({"case": case, "how": how, **in_turn(asked, f"{case}|{how}", arguments.repeats)})
     for side in sides.values():
         side.end()

@@ -161,9 +161,7 @@ def test_torchrls_own_macro_actions_run_by_it():
 
     start, pose = problem(5, seed=10, near=0.2)
     target = as_pose7(pose)
-    transform_ = torchrl_envs.URScriptPrimitiveTransform(
-        cartesian_solver=ArmSolver(ARM, base=BASE), macro_steps=6
-    )
+    transform_ = torchrl_envs.URScriptPrimitiveTransform(cartesian_solver=ArmSolver(ARM, base=BASE), macro_steps=6)
     for path in ("joint", "cartesian"):
         macro = torchrl_envs.RobotMacroAction.reach_pose(
             position=target[:, :3].float(), quaternion=target[:, 3:].float(), steps=6, path=path

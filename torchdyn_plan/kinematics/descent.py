@@ -126,9 +126,7 @@ def evaluate(arm: Arm, q: Tensor) -> tuple[Tensor, Tensor]:
     return pose, jacobian
 
 
-def stepped(
-    search: Search, q: Tensor, jacobian: Tensor, error: Tensor, index: Tensor
-) -> tuple[Tensor, Tensor]:
+def stepped(search: Search, q: Tensor, jacobian: Tensor, error: Tensor, index: Tensor) -> tuple[Tensor, Tensor]:
     """One step of Levenberg and Marquardt (Sugihara 2011: λ² grows with the error), within limits of step and joint.
 
     Returns:

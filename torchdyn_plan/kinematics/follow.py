@@ -194,9 +194,7 @@ def _towards(q: Tensor, reference: Tensor, reach: Tensor) -> Tensor:
     return torch.where(worst <= 1.0, reference, q + way / worst.clamp_min(1.0))
 
 
-def _told(
-    search: Search, state: _State, before: Tensor, valid: Tensor, reach: Tensor
-) -> tuple[Tensor, Tensor]:
+def _told(search: Search, state: _State, before: Tensor, valid: Tensor, reach: Tensor) -> tuple[Tensor, Tensor]:
     """Status ``(M,)`` and residual ``(M, 2)`` of where the joints have come from ``before`` (M, N)."""
     search = search._replace(target=state.target)
     every = torch.arange(len(valid), device=valid.device)
