@@ -20,6 +20,7 @@ SMALL = {
     "forecast_gain": "--episodes 2 --seeds 0 --velocity 5",
     "former_latency": "--former . --planners corner --statics ik --processes 1 --rounds 1 --seconds 0.01 --calls plan",
     "inverse": "--arms ur5 --poses 4 --repeats 1 --former .",
+    "kinematics_beside": "--former . --batches 1 --seconds 0.01 --no-compiled --no-rivals --repeats 1",
     "joint_speeds": "--episodes 4 --num-envs 4",
     "loops": "--planners corner --episodes 4 --steps 30 --loops rollout",
     "latency": "--velocities 5 --episodes 2 --latencies 0 20 --not-compensated 20",
