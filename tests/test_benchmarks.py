@@ -16,8 +16,11 @@ SMALL = {
     "ceiling": "--velocities 5 --episodes 3 --spacing 60 --meetings 1 --leads 7 --rows 64 --split dev",
     "count_calls": "--planners corner --batch 2",
     "diagnose": "--velocities 3 --episodes 4 --arrivals network --split dev",
+    "following": "--arms ur5 --paths 2 --steps 6 --former .",
     "forecast_gain": "--episodes 2 --seeds 0 --velocity 5",
     "former_latency": "--former . --planners corner --statics ik --processes 1 --rounds 1 --seconds 0.01 --calls plan",
+    "inverse": "--arms ur5 --poses 4 --repeats 1 --former .",
+    "kinematics_beside": "--former . --batches 1 --seconds 0.01 --no-compiled --no-rivals --repeats 1",
     "joint_speeds": "--episodes 4 --num-envs 4",
     "loops": "--planners corner --episodes 4 --steps 30 --loops rollout",
     "latency": "--velocities 5 --episodes 2 --latencies 0 20 --not-compensated 20",
@@ -30,16 +33,16 @@ SMALL = {
 }
 ELSEWHERE = {
     "descriptions",
-    "inverse",
     "killed_training",
     "measure_arrivals",
+    "nearest",
     "policy_curves",
     "policy_peers",
     "same_episodes",
 }
 """Minutes at the least, files of other packages, a picture of trainings, what the package's own arrival map is made by,
 or a comparison of files."""
-PARTS = {"arms", "former_latency_side", "study"}
+PARTS = {"arms", "former_latency_side", "sides", "study"}
 """No scripts of their own."""
 
 

@@ -4,6 +4,8 @@ from pathlib import Path
 
 import pytest
 
+from tests.menagerie import write as write_menagerie
+
 EXAMPLES = Path(__file__).parent.parent / "examples"
 
 
@@ -43,3 +45,20 @@ def test_examples_are_short():
         # A whole task is longer; tests/test_own_task.py runs it.
         longest = 120 if file.name == "own_task.py" else 80
         assert len(file.read_text().splitlines()) <= longest, file.name
+
+
+def test_torchrls_own_arm_is_driven(tmp_path):
+    pytest.importorskip("torchrl.envs", reason="TorchRL has the arm")
+    folder = write_menagerie(tmp_path / "menagerie")
+    run = subprocess.run(
+        [sys.executable, EXAMPLES / "torchrl_arm.py", "--menagerie", folder],
+        capture_output=True,
+        text=True,
+        check=False,
+        timeout=300,
+    )
+    assert run.returncode == 0, run.stderr
+    off = {line.split()[0]: float(line.split()[4]) for line in run.stdout.splitlines() if "the pinch is" in line}
+    assert set(off) == {"above", "down", "up"}
+    assert max(off.values()) < 5.0, run.stdout
+    assert "1000 of 1000 poses solved at once" in run.stdout

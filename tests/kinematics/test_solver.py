@@ -142,7 +142,11 @@ def test_free_motion_is_drawn_to_the_posture():
         ({"target": torch.zeros(4, 4)}, "target is torch.float32, but the arm is torch.float64"),
         ({"target": torch.zeros(4, 4, device="meta", dtype=DOUBLE)}, "target is on meta, but the arm is on cpu"),
         ({"q0": torch.zeros(5, dtype=DOUBLE)}, r"q0 must have shape \(\*B, 6\), got \(5,\)"),
-        ({"q0": torch.zeros(3, 6, dtype=DOUBLE)}, r"q0 must have shape \(\*B, 2, 6\), got \(3, 6\)"),
+        ({"q0": torch.zeros(3, 6, dtype=DOUBLE)}, r"q0 must have shape \(2, 6\) or \(6,\), got \(3, 6\)"),
+        (
+            {"target": torch.eye(4, dtype=DOUBLE), "q0": torch.zeros(2, 6, dtype=DOUBLE)},
+            r"q0 must have shape \(6,\) or",
+        ),
         ({"posture": torch.zeros(6)}, "posture is torch.float32"),
         ({"constraint": "axes"}, r"unknown constraint 'axes' \(did you mean 'axis'"),
         ({"symmetry": 0}, "symmetry must be >= 1, got 0"),

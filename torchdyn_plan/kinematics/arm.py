@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import replace
-from typing import TYPE_CHECKING, Any, cast
+from typing import TYPE_CHECKING, Any
 
 import torch
 from torch import Tensor
@@ -175,11 +175,10 @@ class Arm(Precise):
         Raises:
             InputError: a joint has none.
         """
-        unlimited = [
-            name for name, speed in zip(self.joint_names, self.speed_limit.tolist(), strict=True) if speed == math.inf
-        ]
+        limits = enumerate(zip(self.joint_names, self.speed_limit.tolist(), strict=True))
+        unlimited = [repr(name) if name else f"number {index}" for index, (name, speed) in limits if speed == math.inf]
         if unlimited:
-            names = ", ".join(map(repr, unlimited))
+            names = ", ".join(unlimited)
             raise InputError(
                 f"{owner} needs the speed limits of all joints, and the description gives none for {names}: give the "
                 "arm a speed_limit=, one number for all joints or one for each [rad/s; m/s]"
@@ -199,20 +198,20 @@ class Arm(Precise):
         Raises:
             InputError: ``joint_pos`` is not ``(*B, N)``, or of another device or precision than the arm.
         """
+        # A module's attribute that is a module takes as long to look up as a small operation.
+        form: Any = self._modules["form"]
         self.check(joint_pos)
         if joint_pos.ndim == 2:
-            # A module's attribute that is a module takes as long to look up as a small operation.
-            form = cast(SineForm | TransformForm | CoupledForm, self._modules["form"])
             return form.pose_and_jacobian(joint_pos)
         batch = joint_pos.shape[:-1]
-        pose, jacobian = self.form.pose_and_jacobian(joint_pos.reshape(-1, self.num_joints))
+        pose, jacobian = form.pose_and_jacobian(joint_pos.reshape(-1, self.num_joints))
         return pose.view(*batch, 4, 4), jacobian.view(*batch, 6, self.num_joints)
 
     def check(self, joint_pos: Tensor) -> None:
         """Raise `InputError` unless ``joint_pos`` is ``(*B, N)``, of the arm's device and precision."""
-        lower = cast(Tensor, self._buffers["lower"])
+        lower: Any = self._buffers["lower"]
         good = isinstance(joint_pos, Tensor) and joint_pos.dtype == lower.dtype and joint_pos.device == lower.device
-        if good and joint_pos.shape[-1:] == lower.shape:
+        if good and joint_pos.ndim > 0 and joint_pos.shape[-1] == self.num_joints:
             return
         check_trailing_shape("joint_pos", joint_pos, self.num_joints)
         check_same_device("joint_pos", joint_pos, lower.device, "the arm")

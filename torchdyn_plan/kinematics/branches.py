@@ -26,6 +26,11 @@ NUMBER = 8
 """Solutions of a pose at most: two of the shoulder, each with two of the wrist, each with two of the elbow."""
 EXACT = 1e-5
 """Sine of the angle of axes that are parallel, and distance [m] of those that cross, at most."""
+SLACK = 0.6
+"""Power of the precision by which an angle may be outside its limits, to be brought back [rad].
+
+Near singular positions, angles are known by the square root of the precision alone.
+"""
 BLOCK = 64
 """Rows of one product of matrices: a fixed number, so that a row's answer does not depend on its company."""
 
@@ -104,10 +109,12 @@ def all_branches(  # noqa: PLR0917  # All are needed.
     lower, upper = (limit.reshape(-1, 6).T.unsqueeze(1).contiguous() for limit in (lower, upper))
     start = start.T.contiguous().unsqueeze(1)
     angles, solvable = _angles(form, target, (sign * start + offset)[5, 0])
-    q = turned_towards((angles - offset) * sign, start, lower, upper)
-    valid = solvable
-    for column, least, most in zip(q, lower, upper, strict=True):
+    # Of who is at a limit, rounding alone may lead outside.
+    slack, valid = torch.finfo(target.dtype).eps ** SLACK, solvable
+    q = turned_towards((angles - offset) * sign, start, lower - slack, upper + slack)
+    for column, least, most in zip(q, lower - slack, upper + slack, strict=True):
         valid = valid & (column >= least) & (column <= most)
+    q = torch.clamp(q, lower, upper)
     return q.nan_to_num(0.0, 0.0, 0.0).permute(2, 1, 0).contiguous(), valid.T.contiguous()
 
 
@@ -161,7 +168,7 @@ def _angles(form: Universal, target: Tensor, last: Tensor) -> tuple[Tensor, Tens
 
     count = len(target)
     pairs = ((sin1, cos1), (sin5, cos5), (sin6, cos6), (along, -above), (sin3, cos3), (sin2, cos2))
-    sines, cosines = (torch.cat([pair[i].reshape(-1, count) for pair in pairs]) for i in range(2))
+    sines, cosines = (torch.cat([pair[i].flatten(0, -2) for pair in pairs]) for i in range(2))
     q1, q5, q6, sum234, q3, q2 = _angle(sines, cosines).split((2, 2, 2, 2, 4, 8))
     half_turn = math.pi * (1.0 - sides) * 0.5
     q5, q6 = sides * q5.unsqueeze(1), q6.unsqueeze(1) + half_turn
@@ -195,6 +202,8 @@ def _universal(joints: list[Joint], tool: Tensor) -> Universal | str:
     """Constants of a chain, or why it is not of the family."""
     if len(joints) != 6 or any(joint.kind != "revolute" for joint in joints):
         return f"it has {len(joints)} joints of kinds {', '.join(joint.kind for joint in joints)}, not 6 that turn"
+    if any(joint.coupling is not None for joint in joints):
+        return "some of its joints move together"
     axes, places, end = _lines(joints, tool)
     for first, second in ((1, 2), (2, 3)):
         if torch.linalg.cross(axes[first], axes[second]).norm() > EXACT:

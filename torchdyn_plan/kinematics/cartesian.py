@@ -11,7 +11,7 @@ from torchdyn_plan.checks import check_number, check_same_device, check_trailing
 from torchdyn_plan.errors import InputError
 from torchdyn_plan.kinematics.arm import Arm
 from torchdyn_plan.kinematics.follow import follow_rows, following
-from torchdyn_plan.kinematics.solver import ROUNDS, IKResult, inside_limits, solve_rows
+from torchdyn_plan.kinematics.solver import ROUNDS, IKResult, check_task, inside_limits, solve_rows
 from torchdyn_plan.kinematics.targets import is_pose, rotation_matrix, rotation_vector
 from torchdyn_plan.precision import Precise, without_autocast
 
@@ -54,9 +54,10 @@ class ArmSolver(Precise):
         super().__init__()
         if not isinstance(arm, Arm):
             raise InputError(f"arm must be an Arm, as from Arm.from_urdf or Arm.ur5, got {type(arm).__name__}")
-        check_number("iterations", iterations, minimum=1, integer=True)
+        check_task("pose", 1, position_tolerance, rotation_tolerance, iterations)
         place = torch.eye(4, dtype=torch.float64) if base is None else base
-        if place.shape != (4, 4) or not bool(is_pose(place.unsqueeze(0), "pose")):
+        good = isinstance(place, Tensor) and place.shape == (4, 4) and place.is_floating_point()
+        if not good or not bool(is_pose(place.unsqueeze(0), "pose")):
             raise InputError(f"base must be a pose of shape (4, 4), got {base}")
         self.arm, self.iterations = arm, iterations
         self.tolerances = position_tolerance, rotation_tolerance

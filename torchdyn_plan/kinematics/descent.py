@@ -13,10 +13,12 @@ from torchdyn_plan.kinematics.targets import constraint_error, constraint_jacobi
 
 BLOCK = 64
 """Rows of one product of matrices: a fixed number, so that a row's answer does not depend on its company."""
+STUCK = 0.05
+"""A try ends with a step that should take away less than this share of the error: limits or axes in line bar the way.
 
-
-STUCK = 0.1
-"""A try ends where no joint moves by more than this share of the error [rad; m]: the way on is barred by limits."""
+Of a step that is shortened to ``max_step``, as much less is expected. The share has no unit, so arms of any size and in
+any unit are searched alike.
+"""
 
 
 class Search(NamedTuple):
@@ -68,30 +70,26 @@ def descend(search: Search, tries: Tensor, rows: Tensor, *, all_tries: bool = Fa
     best, cost = q.clone(), torch.full((len(q),), torch.inf, dtype=q.dtype, device=q.device)
     residual = cost.unsqueeze(-1).repeat(1, 2)
     here, owner = torch.arange(len(q), device=rows.device), rows.repeat_interleave(number)
+    moving = torch.ones(len(q), dtype=torch.bool, device=rows.device)
     for iteration in range(search.iterations + 1):
         index = owner[here]
         pose, jacobian = evaluate(search.arm, q)
         error = error_at(search, pose, index)
         left = lengths(error)
         now = search.cost(left)
-        nearer = now < cost[here]
+        nearer = (now < cost[here]).nonzero().squeeze(-1)
         better = here[nearer]
         best[better], residual[better], cost[better] = q[nearer], left[nearer], now[nearer]
-        going = now > 1.0
+        going = (now > 1.0) & moving
         if number > 1 and not all_tries:
             ended = (cost <= 1.0).view(count, number).any(dim=1)
             going &= ~ended[here // number]
         if iteration == search.iterations or not bool(going.any()):
             break
-        if not bool(going.all()):
-            here, q, index, jacobian, error = here[going], q[going], index[going], jacobian[going], error[going]
-        after = stepped(search, q, rows_at(search, jacobian, index), error, index)
-        moving = (after - q).abs().amax(dim=-1) > STUCK * error.norm(dim=-1)
-        if not bool(moving.all()):
-            here, after = here[moving], after[moving]
-            if not len(here):
-                break
-        q = after
+        kept = going.nonzero().squeeze(-1)
+        if len(kept) < len(here):
+            here, q, index, jacobian, error = (value[kept] for value in (here, q, index, jacobian, error))
+        q, moving = stepped(search, q, rows_at(search, jacobian, index), error, index)
     return best.view(count, number, joints), residual.view(count, number, 2)
 
 
@@ -128,19 +126,28 @@ def evaluate(arm: Arm, q: Tensor) -> tuple[Tensor, Tensor]:
     return pose, jacobian
 
 
-def stepped(search: Search, q: Tensor, jacobian: Tensor, error: Tensor, index: Tensor) -> Tensor:
-    """One step of Levenberg and Marquardt (Sugihara 2011: λ² grows with the error), within limits of step and joint."""
+def stepped(search: Search, q: Tensor, jacobian: Tensor, error: Tensor, index: Tensor) -> tuple[Tensor, Tensor]:
+    """One step of Levenberg and Marquardt (Sugihara 2011: λ² grows with the error), within limits of step and joint.
+
+    Returns:
+        Where the joints are then, ``(A, N)``, and whether it is worth going on from there, ``(A,)``; see `STUCK`.
+    """
     lower, upper = search.bounds(index)
-    damping = (0.1 * (error * error).sum(dim=-1) + _least_damping(q.dtype)).sqrt()
+    square = (error * error).sum(dim=-1)
+    damping = (0.1 * square + _least_damping(q.dtype)).sqrt()
     preferred = None if search.posture is None else 0.3 * (search.posture[index] - q)
+    eased = jacobian
     if search.ease is not None:
-        jacobian = jacobian * search.ease
+        eased = jacobian * search.ease
         preferred = None if preferred is None else preferred / search.ease
-    step = dls_step_within(jacobian, error, damping, q, lower, upper, preferred=preferred)
+    step = dls_step_within(eased, error, damping, q, lower, upper, preferred=preferred)
     if search.ease is not None:
         step = step * search.ease
-    worst = (step.abs() / search.max_step).amax(dim=-1, keepdim=True)
-    return torch.clamp(q + step / worst.clamp_min(1.0), lower, upper)
+    worst = (step.abs() / search.max_step).amax(dim=-1, keepdim=True).clamp_min(1.0)
+    after = torch.clamp(q + step / worst, lower, upper)
+    # What the step takes away of the error to first order, times the error.
+    taken = ((jacobian @ (after - q).unsqueeze(-1)).squeeze(-1) * error).sum(dim=-1)
+    return after, taken * worst.squeeze(-1) > STUCK * square
 
 
 def _least_damping(dtype: torch.dtype) -> float:

@@ -8,13 +8,13 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from torchdyn_plan.checks import check_choice, check_number
+from torchdyn_plan.checks import check_number
 from torchdyn_plan.errors import InputError
 from torchdyn_plan.kinematics.arm import Arm
 from torchdyn_plan.kinematics.descent import Search, descend, evaluate, residual_at
 from torchdyn_plan.kinematics.nearest import speeds
-from torchdyn_plan.kinematics.solver import IKResult, IKStatus, inside_limits, solve_rows
-from torchdyn_plan.kinematics.targets import CONSTRAINTS, as_pose, as_rows, is_pose
+from torchdyn_plan.kinematics.solver import IKResult, IKStatus, check_task, inside_limits, reason, solve_rows
+from torchdyn_plan.kinematics.targets import as_pose, as_rows, is_pose
 from torchdyn_plan.precision import without_autocast
 
 TIGHT = 0.1
@@ -23,6 +23,8 @@ PATIENCE = 5
 """Steps after which a row that does not come to its target looks for another way to it, each time."""
 RESTARTS = (1, 16)
 """Starts of such a search."""
+FULL_SPEED = 0.999
+"""Share of its speed limit from which a joint counts as being at it."""
 
 
 class _State(NamedTuple):
@@ -82,9 +84,7 @@ def follow(
     Raises:
         InputError: a shape, device, precision, name or number is wrong.
     """
-    check_choice("constraint", constraint, CONSTRAINTS)
-    check_number("symmetry", symmetry, minimum=1, integer=True)
-    check_number("iterations", iterations, minimum=1, integer=True)
+    check_task(constraint, symmetry, position_tolerance, rotation_tolerance, iterations)
     check_number("dt", dt, minimum=1e-9)
     poses = as_pose(poses, arm, constraint, name="poses")
     if poses.ndim < 3:
@@ -125,9 +125,9 @@ def follow_rows(
     state = _State(start, inside, outside, late, evaluate(search.arm, inside)[0])
     for step in range(steps):
         valid = good & is_pose(poses[:, step], search.constraint)
-        state = _advance(search, state, poses[:, step], valid, reach, patience)
+        before, state = state.q, _advance(search, state, poses[:, step], valid, reach, patience)
         q[:, step] = state.q
-        status[:, step], residual[:, step] = _told(search, state, valid)
+        status[:, step], residual[:, step] = _told(search, state, before, valid, reach)
     return q, status, residual
 
 
@@ -194,15 +194,18 @@ def _towards(q: Tensor, reference: Tensor, reach: Tensor) -> Tensor:
     return torch.where(worst <= 1.0, reference, q + way / worst.clamp_min(1.0))
 
 
-def _told(search: Search, state: _State, valid: Tensor) -> tuple[Tensor, Tensor]:
-    """Status ``(M,)`` and residual ``(M, 2)`` of where the joints are."""
+def _told(search: Search, state: _State, before: Tensor, valid: Tensor, reach: Tensor) -> tuple[Tensor, Tensor]:
+    """Status ``(M,)`` and residual ``(M, 2)`` of where the joints have come from ``before`` (M, N)."""
     search = search._replace(target=state.target)
     every = torch.arange(len(valid), device=valid.device)
     q = torch.where(valid.unsqueeze(-1), state.q, state.reference)
     residual = residual_at(search, q, every)
-    solved = search.cost(residual) <= 1.0
+    status = torch.where(search.cost(residual) <= 1.0, int(IKStatus.SOLVED), int(IKStatus.LATE))
+    as_fast = ((state.q - before).abs() >= FULL_SPEED * _within(before, reach)).any(dim=-1)
+    stopped = (valid & (status != IKStatus.SOLVED) & ~as_fast).nonzero().squeeze(-1)
+    if len(stopped):
+        status[stopped] = reason(search, q[stopped], stopped)
     outside = ((q < search.arm.lower) | (q > search.arm.upper)).any(dim=-1)
-    status = torch.where(solved, int(IKStatus.SOLVED), int(IKStatus.LATE))
     status[outside] = int(IKStatus.LIMITED)
     status[~valid] = int(IKStatus.INVALID)
     return status, residual.masked_fill(~valid.unsqueeze(-1), torch.inf)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from itertools import pairwise, repeat
-from typing import cast
+from typing import Any, cast
 
 import torch
 from torch import Tensor, nn
@@ -71,8 +71,8 @@ class SineForm(Precise):
         """Pose ``(B, 4, 4)`` and Jacobian ``(B, 6, N)``, for ``(B, N)``."""
         if autocast_is_on():
             return without_autocast(self.pose_and_jacobian, joint_pos)
-        own = cast(dict[str, Tensor], self._buffers)
-        sines = torch.addmm(own["_phases"], joint_pos, own["_frequencies"]).sin()
+        own: Any = self._buffers
+        sines = torch.addmm(own["_phases"], joint_pos, own["_frequencies"]).sin_()
         pose, jacobian = torch.mm(sines, own["_pose_weights"]), torch.mm(sines, own["_jacobian_weights"])
         if own["_pose_slopes"] is not None:
             pose = torch.addmm(pose, joint_pos, own["_pose_slopes"])

@@ -23,6 +23,8 @@ from torchdyn_plan.precision import without_autocast
 
 ROUNDS = (1, 4, 16, 64, 128)
 """Starts that a row still unsolved is given, side by side, in each round."""
+LEAST_TOLERANCE = 1e-12
+"""[m; rad]; below it, nothing is ever solved."""
 OVERSHOOT = 0.1
 """[rad; m]; a start that is further outside its limits is turned by 2π where that brings it inside."""
 
@@ -41,7 +43,7 @@ class IKStatus(IntEnum):
     INVALID = 4
     """The target or the start is NaN or infinite, or the target's rotation is not one; nothing was solved."""
     LATE = 5
-    """As `UNREACHED`, with a joint at its speed limit; of `follow` alone."""
+    """Not there yet, with a joint at its speed limit; of `follow` alone."""
 
 
 class IKResult(NamedTuple):
@@ -119,9 +121,11 @@ def solve_ik(
     Raises:
         InputError: a shape, device, precision, name or number is wrong.
     """
-    check_choice("constraint", constraint, CONSTRAINTS)
-    check_number("symmetry", symmetry, minimum=1, integer=True)
-    check_number("iterations", iterations, minimum=1, integer=True)
+    check_task(constraint, symmetry, position_tolerance, rotation_tolerance, iterations)
+    if not isinstance(rounds, Sequence) or not rounds:
+        raise InputError(f"rounds must be numbers of starts, one for each round, got {rounds!r}")
+    for number in rounds:
+        check_number("each of rounds", number, minimum=1, integer=True)
     if solutions is not None:
         check_number("solutions", solutions, minimum=1, integer=True)
     target = as_pose(target, arm, constraint)
@@ -146,6 +150,17 @@ def solve_ik(
     return result._replace(q=refine(arm, wanted, result.q, solved, constraint=constraint, symmetry=symmetry))
 
 
+def check_task(
+    constraint: str, symmetry: int, position_tolerance: float, rotation_tolerance: float, iterations: int
+) -> None:
+    """Raise `InputError` unless these are what `solve_ik` and `follow` take."""
+    check_choice("constraint", constraint, CONSTRAINTS)
+    check_number("symmetry", symmetry, minimum=1, integer=True)
+    check_number("position_tolerance", position_tolerance, minimum=LEAST_TOLERANCE)
+    check_number("rotation_tolerance", rotation_tolerance, minimum=LEAST_TOLERANCE)
+    check_number("iterations", iterations, minimum=1, integer=True)
+
+
 def joint_numbers(name: str, value: float | Tensor, arm: Arm) -> Tensor:
     """A positive number, or one for each joint, as ``(N,)``."""
     if not isinstance(value, Tensor):
@@ -157,12 +172,15 @@ def joint_numbers(name: str, value: float | Tensor, arm: Arm) -> Tensor:
 
 
 def inside_limits(arm: Arm, q: Tensor) -> Tensor:
-    """``q`` (*B, N) within the limits: the same pose where whole turns bring it there, else the nearest position."""
+    """``q`` (*B, N) within the limits: the same pose where whole turns bring it there, else the nearest position.
+
+    What is not finite stays so.
+    """
     q, turns = reduced(arm, q), revolute(arm)
     outside = torch.maximum(arm.lower - q, q - arm.upper)
     turned = turned_towards(q, torch.clamp(q, arm.lower, arm.upper), arm.lower, arm.upper)
     q = torch.where(turns & (outside > OVERSHOOT), turned, q)
-    return torch.where(q.isnan(), q, torch.clamp(q, arm.lower, arm.upper))
+    return torch.where(q.isfinite(), torch.clamp(q, arm.lower, arm.upper), q)
 
 
 def _limits(arm: Arm, start: Tensor | None, max_move: float | Tensor | None) -> tuple[Tensor, Tensor]:

@@ -33,7 +33,8 @@ def as_rows(name: str, value: Tensor, arm: Arm, batch: torch.Size) -> Tensor:
     check_trailing_shape(name, value, arm.num_joints)
     check_like(name, value, arm)
     if value.shape[:-1] not in (batch, torch.Size()):
-        check_trailing_shape(name, value, *batch, arm.num_joints)
+        wanted = (*batch, arm.num_joints)
+        raise InputError(f"{name} must have shape {wanted} or {wanted[-1:]}, got {tuple(value.shape)}")
     return value.detach().expand(*batch, arm.num_joints).reshape(-1, arm.num_joints)
 
 

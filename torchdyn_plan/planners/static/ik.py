@@ -81,7 +81,6 @@ class IKPlanner(Precise, StaticPlannerModule):
         super().__init__()
         if not isinstance(arm, Arm):
             raise InputError(f"arm must be an Arm, as from Arm.from_urdf or Arm.ur5, got {type(arm).__name__}")
-        _check_speeds(arm)
         if chunk is not None:
             check_number("chunk", chunk, minimum=1, integer=True)
         remembered: list[Any] = [(keys.PLAN, name) for name in PATH_NAMES]
@@ -91,7 +90,7 @@ class IKPlanner(Precise, StaticPlannerModule):
         self.control_step, self.damping, self.gain, self.chunk = control_step, damping, gain, chunk
         self.compiled = compiled
         self._fused = Fused(self._fused_step) if compiled else None
-        self.register_buffer("_limit", self.arm.speed_limit * control_step, False)
+        self.register_buffer("_limit", arm.needed_speed_limit("IKPlanner") * control_step, False)
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         """Write ``action`` for the ``goal`` in ``tensordict``, on a new path where the old one is used up or stale.
@@ -241,14 +240,3 @@ class IKPlanner(Precise, StaticPlannerModule):
             return self.arm.pose_and_jacobian(joint_pos)
         pose, jacobian = zip(*map(self.arm.pose_and_jacobian, joint_pos.split(self.chunk)), strict=True)
         return torch.cat(pose), torch.cat(jacobian)
-
-
-def _check_speeds(arm: Arm) -> None:
-    """Raise `InputError` unless every joint has a speed limit, of which actions are shares."""
-    limits = zip(arm.joint_names, arm.speed_limit.tolist(), strict=True)
-    without = [name or f"number {index}" for index, (name, limit) in enumerate(limits) if not 0.0 < limit < math.inf]
-    if without:
-        raise InputError(
-            f"the arm has no speed limit for {', '.join(map(repr, without))}, and actions are shares of it: give "
-            "speed_limit= [rad/s; m/s] where the arm is made"
-        )
