@@ -104,6 +104,11 @@ class ComposedPlanner(PretrainedPlanner, Remembering):
         super().train(mode)
         return self.prepare()
 
+    def requires_grad_(self, requires_grad: bool = True) -> Self:
+        """As of every module, and prepare the models where they have no derivatives."""
+        super().requires_grad_(requires_grad)
+        return self.prepare()
+
     def prepare(self) -> Self:
         """Copy the models as they are now, for inference; in training mode leave the copies. Returns the planner."""
         self.prepared = None if self.training else Prepared.of(self.forecaster, self.eta)
