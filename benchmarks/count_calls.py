@@ -10,6 +10,7 @@ stands in another file than the call before it.
 
 from __future__ import annotations
 
+import copy
 import sys
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
@@ -116,7 +117,7 @@ def acts(task: Task, planners: Sequence[str], batch: int) -> Iterator[tuple[str,
         planner = task.planner(name)
         forms = {name: planner}
         if isinstance(planner, DynamicPlanner):
-            forms[f"{name} for inference"] = planner.for_inference()
+            forms[f"{name} in training mode"] = copy.deepcopy(planner).train()
         for form, one in forms.items():
             for what, calls in follow_planner(one, env).items():
                 yield f"{form}, {what}", calls

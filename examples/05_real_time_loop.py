@@ -16,7 +16,7 @@ STEPS = 500  # two seconds
 
 torch.set_num_threads(1)
 env = TrapperEnv(num_envs=1, velocity=2.0, seed=0, num_threads=1)
-planner = DynamicPlanner.from_pretrained("trapper-ik-wait_and_drop").for_inference()
+planner = DynamicPlanner.from_pretrained("trapper-ik-wait_and_drop")
 
 
 def run_loop() -> tuple[int, int, int]:

@@ -9,6 +9,8 @@ from pathlib import Path
 
 import pytest
 
+from torchdyn_plan.tasks import load_task
+
 BENCHMARKS = Path(__file__).parent.parent / "benchmarks"
 SMALL = {
     "ablation": "--velocities 3 --episodes 2 --num-envs 2 --split dev",
@@ -70,6 +72,16 @@ def test_benchmark_runs(name, tmp_path):
 def study(monkeypatch):
     monkeypatch.syspath_prepend(BENCHMARKS)
     return importlib.import_module("study")
+
+
+def test_a_planning_step_goes_through_few_calls_in_few_files(study):
+    count_calls = importlib.import_module("count_calls")
+    followed = dict(count_calls.acts(load_task("trapper"), ["wait_and_drop"], batch=2))
+    plans = count_calls.count(followed["wait_and_drop, a step that plans"])
+    between = count_calls.count(followed["wait_and_drop, a step between plans"])
+    assert 40 < plans["calls"] <= 60, plans
+    assert plans["files"] <= 12, plans
+    assert 20 < between["calls"] <= 30, between
 
 
 def test_a_killed_study_goes_on_with_the_rows_in_its_file(study, tmp_path):

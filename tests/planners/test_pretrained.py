@@ -74,7 +74,7 @@ def due():
 def test_a_planner_by_name_is_the_one_put_together_from_its_parts(shipped, due):
     forecaster, eta = shipped[1]
     planner = DynamicPlanner.from_pretrained("trapper-ik", static=ik_planner(chunk=4), chunk=4)
-    by_hand = DynamicPlanner(ik_planner(chunk=4), forecaster.eval(), eta.eval(), chunk=4)
+    by_hand = DynamicPlanner(ik_planner(chunk=4), forecaster, eta, chunk=4).eval().requires_grad_(False)
     with torch.no_grad():
         one, other = planner(due.clone()), by_hand(due.clone())
     assert one["plan", "replanned"].all()
@@ -90,7 +90,7 @@ def test_a_learned_policy_comes_with_its_own_arrival_times(shipped, due):
     eta.save_pretrained(shipped[0] / "eta-trapper-rl.safetensors")
     planner = DynamicPlanner.from_pretrained("trapper-rl")
     policy = PolicyPlanner(actor.eval(), approach=BoxApproach.of(SCENE))
-    by_hand = DynamicPlanner(policy, shipped[1][0].eval(), eta.eval())
+    by_hand = DynamicPlanner(policy, shipped[1][0], eta).eval().requires_grad_(False)
     with torch.no_grad():
         one, other = planner(due.clone()), by_hand(due.clone())
     assert_same(one, other)

@@ -42,7 +42,8 @@ def make_forms(
 ) -> list[Form]:
     """Everything that is timed on ``device``."""
     dynamic = {name: planner for name, planner in planners.items() if isinstance(planner, DynamicPlanner)}
-    plain = _planning(dynamic, dynamic)
+    # A planner that was just made is in training mode, and prepares no copies.
+    plain = _planning(dynamic, {name: type(planner)(**planner.part_settings()) for name, planner in dynamic.items()})
     light = _planning_for_inference(dynamic)
     alone: dict[str, Parts] = {}
     for name, planner in planners.items():

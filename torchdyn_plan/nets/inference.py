@@ -7,11 +7,14 @@ products as everything else: these networks are in float32 or float64, even thos
 from __future__ import annotations
 
 import copy
+import operator
+from collections.abc import Iterable, Sequence
 from functools import partial
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Self
 
 import torch
 from torch import Tensor, nn
+from torch.func import debug_unwrap
 
 from torchdyn_plan.checks import check_choice, network_input
 from torchdyn_plan.nets.arrival import ArrivalModel, ArrivalQuery
@@ -33,6 +36,50 @@ def hold_constants(module: nn.Module, dtype: torch.dtype, **constants: Tensor) -
     dtype = torch.promote_types(dtype, torch.float32)
     for name, value in constants.items():
         module.register_buffer(name, value.detach().to(dtype).contiguous(), persistent=False)
+
+
+class Prepared:
+    """Copies of models for inference, and the weights of which they were made."""
+
+    def __init__(self, models: Sequence[nn.Module], copies: Sequence[Any]) -> None:
+        """Hold ``copies`` of ``models``, made just now."""
+        self.copies = tuple(copies)
+        self._weights = [(table, name, value, value._version) for table, name, value in _weights_of(models)]
+
+    @classmethod
+    def of(cls, *models: Any) -> Self | None:
+        """Copies of ``models``; None where there is nothing to gain, or their weights may change unseen."""
+        weights = [value for _, _, value in _weights_of(models)]
+        if any(value.requires_grad or value.is_inference() or _is_shared(value) for value in weights):
+            return None
+        copies = [model.for_inference() for model in models]
+        return None if all(map(operator.is_, copies, models)) else cls(models, copies)
+
+    def stands_for(self, *inputs: Tensor) -> bool:
+        """Whether the copies may be asked about ``inputs`` in place of the models.
+
+        Not where weights are others by now, or some derivative may be asked for; nor while compiling, whose graph holds
+        the weights themselves, nor under ``torch.func``, which may exchange them.
+        """
+        if torch.compiler.is_compiling() or any(debug_unwrap(value) is not value for value in inputs):
+            return False
+        if torch.is_grad_enabled() and any(value.requires_grad for value in inputs):
+            return False
+        return all(
+            table[name] is value and value._version == version and not value.requires_grad
+            for table, name, value, version in self._weights
+        )
+
+
+def _weights_of(models: Iterable[nn.Module]) -> list[tuple[dict[str, Any], str, Tensor]]:
+    """Every parameter and buffer of ``models``: the table that holds it, and its name there."""
+    tables = [table for model in models for part in model.modules() for table in (part._parameters, part._buffers)]
+    return [(table, name, value) for table in tables for name, value in table.items() if value is not None]
+
+
+def _is_shared(value: Tensor) -> bool:
+    """Whether other processes may change ``value``; memory of other devices calls itself shared always."""
+    return value.device.type == "cpu" and value.is_shared()
 
 
 class InferenceForecaster(Precise, DescribedForecast):
@@ -92,10 +139,12 @@ class InferenceForecaster(Precise, DescribedForecast):
 
     def forward(self, target_history: Tensor) -> Tensor:
         """Positions at the next F control steps, ``(*B, F, 3)`` [m, world], as `Forecaster.forward` describes."""
+        network_input("target_history", target_history, self.config.history, 3, like=self.head_weight)
         return self._forecast(target_history)[0]
 
     def describe(self, target_history: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         """The same forecast, and what a spread is told by, as `Forecaster.describe` describes."""
+        network_input("target_history", target_history, self.config.history, 3, like=self.head_weight)
         forecast, hidden, turn = self._forecast(target_history)
         batch = target_history.shape[:-2]
         hidden = in_type_of(forecast, hidden).view(*batch, self.config.hidden)
@@ -106,7 +155,9 @@ class InferenceForecaster(Precise, DescribedForecast):
         config, like = self.config, self.head_weight
         if autocast_is_on():
             return without_autocast(self._forecast, target_history)
-        seen = network_input("target_history", target_history, config.history, 3, like=like)
+        seen = target_history
+        if seen.shape[-2:] != (config.history, 3) or seen.dtype != like.dtype or seen.device != like.device:
+            seen = network_input("target_history", seen, config.history, 3, like=like, finite=False)
         history = seen.reshape(-1, config.history, 3)
         if config.square_symmetry:
             # The nearest of the eight octants' middles says how a row is turned, and its line turned back and shifted.
@@ -126,7 +177,10 @@ class InferenceForecaster(Precise, DescribedForecast):
         return path if seen is target_history else path.to(target_history.dtype), hidden, turn
 
     def predict(self, *seen: Tensor) -> Forecast:
-        """The path, and its spread if there is a network that judges it."""
+        """The path, and its spread if there is a network that judges it.
+
+        Whoever asks, as a planner, has looked for what is no number: nothing of its row is.
+        """
         path, hidden, turn = self._forecast(*seen)
         if not self.judged:
             return Forecast(path)
@@ -226,27 +280,33 @@ class InferenceETA(Precise, ArrivalModel):
         """Scores of the bins, ``(*B, bins + 1)``, as `ETANetwork.forward` describes."""
         if autocast_is_on():
             return without_autocast(self.forward, robot_state, goal)
-        network_input("goal", goal, 3, like=self.head_weight)
+        self._check(robot_state, goal)
         return self.scores(*self._share(robot_state), goal).to(goal.dtype)
 
     def arrival(self, robot_state: Tensor, goal: Tensor, *, estimator: str = "mode") -> Arrival:
         """Arrival time at ``goal (*B, 3)`` from ``robot_state (*B, S)``, as `ETANetwork.arrival` describes."""
-        network_input("goal", goal, 3, like=self.head_weight)
+        self._check(robot_state, goal)
         return self.read(*self._share(robot_state), goal, estimator=estimator)
 
     def from_state(self, robot_state: Tensor) -> ArrivalQuery:
         """Arrivals from ``robot_state`` (*B, S) at goals (*B, K, 3): the state's part of the work is done once.
 
-        Goals are a search's own, and not looked at.
+        Whoever asks, as a planner, has looked for what is no number; goals are a search's own.
         """
         return partial(self.read, *self._share(robot_state.unsqueeze(-2)))
 
+    def _check(self, robot_state: Tensor, goal: Tensor) -> None:
+        """Raise `InputError` for an input that is none."""
+        network_input("goal", goal, 3, like=self.head_weight)
+        network_input("robot_state", robot_state, self.config.robot_state_size, like=self.head_weight)
+
     def _share(self, robot_state: Tensor) -> tuple[Tensor, Tensor]:
         """The tool's place in states (*B, S), and their share of the first layer, ``(*B, hidden)``."""
-        weight, size = self.state_weight, self.config.robot_state_size
+        weight, size, seen = self.state_weight, self.config.robot_state_size, robot_state
         if autocast_is_on():
             return without_autocast(self._share, robot_state)
-        seen = network_input("robot_state", robot_state, size, like=weight)
+        if seen.shape[-1:] != (size,) or seen.dtype != weight.dtype or seen.device != weight.device:
+            seen = network_input("robot_state", seen, size, like=weight, finite=False)
         tool_pos = seen[..., slice(*self.config.tool_slice)]
         return tool_pos, nn.functional.linear(seen, weight.mT, self.state_bias)
 
@@ -293,14 +353,13 @@ def _convolution(layer: Any, length: int) -> tuple[Tensor, Tensor, int, bool]:
     """Weight, bias and length of the output of a convolution of ``length`` steps, and whether it is written out."""
     from torchdyn_plan.nets.forecaster import convolve
 
-    channels = layer.in_channels
+    channels, after = layer.in_channels, max(length // 2, 1)
+    padded = length < 3 or (length - 3) % 2 != 0
+    if not padded and length * after * channels**2 > DENSE:
+        return layer.weight.permute(2, 1, 0).flatten(0, 1), layer.bias, after, False
     unit = torch.eye(length * channels, dtype=torch.float64).view(-1, length, channels)
     none = convolve(torch.zeros_like(unit[:1]), layer)
-    written = (convolve(unit, layer) - none).flatten(1)
-    after, padded = none.shape[1], length < 3 or (length - 3) % 2 != 0
-    if padded or written.numel() <= DENSE:
-        return written, none.flatten(), after, True
-    return layer.weight.permute(2, 1, 0).flatten(0, 1), layer.bias, after, False
+    return (convolve(unit, layer) - none).flatten(1), none.flatten(), after, True
 
 
 def _join(network: Forecaster) -> tuple[Tensor, Tensor]:

@@ -15,7 +15,7 @@ from torchdyn_plan.nets.arrival import ArrivalQuery
 from torchdyn_plan.nets.forecast import Forecast, ForecastModel
 from torchdyn_plan.planners.judging import act, judge_rows
 from torchdyn_plan.planners.memory import Remembering
-from torchdyn_plan.planners.planner import DynamicPlanner
+from torchdyn_plan.planners.planner import DynamicPlanner, are_sane
 from torchdyn_plan.planners.protocol import StaticPlanner, keys_read, keys_written, read
 from torchdyn_plan.planners.search.meeting import NO_CONTEXT, Meeting, SearchContext
 from torchdyn_plan.planners.static.callable import TensorDictFunction
@@ -38,11 +38,13 @@ class TargetPursuit(Remembering):
         """
         target_pos = read(tensordict, keys.TARGET_POS, "TargetPursuit")
         check_trailing_shape(keys.TARGET_POS, target_pos, 3)
-        bad = judge_rows(tensordict, self.in_keys, target_pos.shape[:-1])
+        bad = None
+        if not are_sane(tensordict, self.in_keys):
+            bad = judge_rows(tensordict, self.in_keys, target_pos.shape[:-1])
         tensordict.set(keys.GOAL, target_pos)
         now = torch.zeros(target_pos.shape[:-1], dtype=torch.int64, device=target_pos.device)
         tensordict.set(keys.ARRIVAL_STEPS, now)
-        return act(self.static, tensordict, bad)
+        return self.static(tensordict) if bad is None else act(self.static, tensordict, bad)
 
     def empty_memory(self, like: Tensor) -> dict[str, Tensor]:
         """The static planner's, as `Remembering` says."""

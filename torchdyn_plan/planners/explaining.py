@@ -2,11 +2,9 @@
 
 from __future__ import annotations
 
-import functools
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from typing import Any, NamedTuple
 
-import torch
 from tensordict import TensorDictBase
 from torch import Tensor
 
@@ -17,27 +15,12 @@ COUNTS = (keys.STEP_COUNT, keys.HISTORY_LENGTH, keys.EPISODE)
 """Keys that hold whole numbers."""
 
 
-def explained(forward: Callable[..., Any]) -> Callable[..., Any]:
-    """``forward`` of a planner, whose errors of other libraries become an `InputError` where the input explains them.
-
-    Nothing is looked at before something fails: a step that works costs nothing more.
-    """
-
-    @functools.wraps(forward)
-    def explaining(self: Any, tensordict: Any, *more: Any, **settings: Any) -> Any:
-        if torch.compiler.is_compiling():
-            return forward(self, tensordict, *more, **settings)
-        try:
-            return forward(self, tensordict, *more, **settings)
-        except Exception as error:
-            fault = find_fault(tensordict, self.in_keys, type(self).__name__)
-            # An error of our own that names the entry says more of it.
-            named = isinstance(error, TorchdynPlanError) and fault is not None and fault.name in str(error)
-            if fault is None or named:
-                raise
-            raise InputError(fault.sentence) from error
-
-    return explaining
+def explain(error: Exception, planner: Any, tensordict: Any) -> InputError | None:
+    """What is wrong with the ``tensordict`` on which a ``planner`` failed with ``error``; None if it is not that."""
+    fault = find_fault(tensordict, planner.in_keys, type(planner).__name__)
+    # An error of our own that names the entry says more of it.
+    named = isinstance(error, TorchdynPlanError) and fault is not None and fault.name in str(error)
+    return None if fault is None or named else InputError(fault.sentence)
 
 
 class Fault(NamedTuple):

@@ -1,4 +1,4 @@
-"""Which rows of what a planner reads are of use: judged once a step, in one place."""
+"""Which rows of what a planner reads are of use: judged in one place, at a step at which something is wrong."""
 
 from __future__ import annotations
 
@@ -52,8 +52,6 @@ def judge(
     plan = _stored(tensordict)
     robot = [observation.tool_pos, observation.robot_state, *_present(tensordict, plan, read_by_static)]
     memory = [plan[name] for name in remembered if name in plan]
-    if are_sane([*robot, *target, *memory]):
-        return observation, GOOD
     batch = observation.tool_pos.shape[:-1]
     blind, unseen, spoiled = (bad_rows(values, batch) for values in (robot, target, memory))
     clean = observation._replace(
@@ -65,21 +63,9 @@ def judge(
     return clean, Judgement(blind, blind | unseen, spoiled)
 
 
-def judge_rows(tensordict: TensorDictBase, read: Sequence[Any], batch: torch.Size) -> Tensor | None:
-    """As `bad_rows`, of the entries ``read`` that are there; None where every row is good."""
-    values = _present(tensordict, _stored(tensordict), read)
-    return None if are_sane(values) else bad_rows(values, batch)
-
-
-def are_sane(values: Sequence[Tensor]) -> bool:
-    """Whether all of ``values`` can be looked at and hold nothing but numbers of a size that a measurement can have."""
-    if torch.compiler.is_compiling() or any(debug_unwrap(value) is not value for value in values):
-        return False
-    flat = torch.cat([value.reshape(-1) for value in values if value.is_floating_point()])
-    if not len(flat):
-        return True
-    low, high = torch.aminmax(flat)
-    return low.item() >= -LARGEST and high.item() <= LARGEST
+def judge_rows(tensordict: TensorDictBase, read: Sequence[Any], batch: torch.Size) -> Tensor:
+    """As `bad_rows`, of the entries ``read`` that are there."""
+    return bad_rows(_present(tensordict, _stored(tensordict), read), batch)
 
 
 def bad_rows(values: Sequence[Tensor], batch: torch.Size) -> Tensor:
@@ -92,13 +78,11 @@ def bad_rows(values: Sequence[Tensor], batch: torch.Size) -> Tensor:
     return bad
 
 
-def act(static: Any, tensordict: TensorDictBase, blind: Tensor | None) -> TensorDictBase:
+def act(static: Any, tensordict: TensorDictBase, blind: Tensor) -> TensorDictBase:
     """Let the ``static`` planner act; rows that are ``blind`` (*B,) get action 0, whatever it makes of them.
 
     It is shown zeros there, in a copy: what was read stays as it was. A goal of theirs that is no number is 0, too.
     """
-    if blind is None:
-        return static(tensordict)
     goal = tensordict.get(keys.GOAL)
     tensordict.set(keys.GOAL, _zero(goal, bad_rows([goal], goal.shape[:-1])))
     copy = tensordict.copy()

@@ -15,7 +15,7 @@ from torch.func import debug_unwrap
 
 from torchdyn_plan import keys
 from torchdyn_plan.errors import InputError
-from torchdyn_plan.planners.explaining import explained
+from torchdyn_plan.planners.explaining import explain
 from torchdyn_plan.planners.maneuver import Maneuver, NoState
 from torchdyn_plan.planners.plan import Plan
 from torchdyn_plan.planners.rows import where_rows
@@ -138,13 +138,21 @@ def remember(tensordict: TensorDictBase, entries: Mapping[str, Tensor]) -> None:
 class Remembering(TensorDictModuleBase):
     """A planner that keeps its memory in the tensordict under ``plan``.
 
-    Where its ``forward`` fails for what is in the tensordict, an `InputError` says so in one sentence.
+    Where it fails for what is in the tensordict, an `InputError` says so in one sentence. Nothing is looked at before
+    something fails: a step that works costs nothing more.
     """
 
-    def __init_subclass__(cls, **settings: Any) -> None:
-        super().__init_subclass__(**settings)
-        if "forward" in cls.__dict__:
-            cls.forward = explained(cls.__dict__["forward"])
+    def __call__(self, tensordict: Any, *more: Any, **settings: Any) -> Any:
+        """As of every module."""
+        if torch.compiler.is_compiling():
+            return super().__call__(tensordict, *more, **settings)
+        try:
+            return super().__call__(tensordict, *more, **settings)
+        except Exception as error:
+            explanation = explain(error, self, tensordict)
+            if explanation is None:
+                raise
+            raise explanation from error
 
     def empty_memory(self, like: Tensor) -> dict[str, Tensor]:
         """Entries below ``plan`` of rows at step 0, in the batch, type and device of ``like`` (*B, 3); none here."""

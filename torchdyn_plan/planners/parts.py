@@ -13,6 +13,7 @@ from torchdyn_plan.checks import check_choice, check_number
 from torchdyn_plan.errors import InputError
 from torchdyn_plan.nets.arrival import ArrivalModel, FunctionArrival
 from torchdyn_plan.nets.forecast import ForecastModel, FunctionForecast
+from torchdyn_plan.nets.inference import Prepared
 from torchdyn_plan.planners.delivery import Delivery
 from torchdyn_plan.planners.maneuver import GoTo, Maneuver
 from torchdyn_plan.planners.memory import REPORTED, PlannerMemory, Remembering
@@ -32,8 +33,12 @@ PARTS = ("static", "forecaster", "eta", "search", "schedule", "maneuver", "deliv
 class ComposedPlanner(PretrainedPlanner, Remembering):
     """Holds the parts of a planner for a moving target; `DynamicPlanner` says what is done with them.
 
-    Parts do not change afterwards: `with_parts` makes another planner.
+    Parts do not change afterwards: `with_parts` makes another planner. In evaluation mode, in which planners are
+    loaded, ``prepared`` holds copies of its models for inference. Plans are made by these wherever they stand for the
+    models: `torchdyn_plan.nets.inference.Prepared` says where. ``train()`` leaves them, and ``eval()`` makes them anew.
     """
+
+    prepared: Prepared | None = None
 
     def __init__(
         self,
@@ -93,6 +98,34 @@ class ComposedPlanner(PretrainedPlanner, Remembering):
     def part_settings(self) -> dict[str, Any]:
         """Arguments that make the same planner."""
         return {name: getattr(self, name) for name in PARTS}
+
+    def train(self, mode: bool = True) -> Self:
+        """As of every module, and prepare the models where they are not to be trained."""
+        super().train(mode)
+        return self.prepare()
+
+    def requires_grad_(self, requires_grad: bool = True) -> Self:
+        """As of every module, and prepare the models where they have no derivatives."""
+        super().requires_grad_(requires_grad)
+        return self.prepare()
+
+    def prepare(self) -> Self:
+        """Copy the models as they are now, for inference; in training mode leave the copies. Returns the planner."""
+        self.prepared = None if self.training else Prepared.of(self.forecaster, self.eta)
+        return self
+
+    def _apply(self, fn: Callable[[Tensor], Tensor], recurse: bool = True) -> Self:
+        """As of every module, which moves and converts by it."""
+        super()._apply(fn, recurse)
+        return self.prepare()
+
+    def __getstate__(self) -> dict[str, Any]:
+        # A copy has weights of its own, of which it prepares its models.
+        return {**self.__dict__, "prepared": None}
+
+    def __setstate__(self, state: dict[str, Any]) -> None:
+        super().__setstate__(state)
+        self.prepare()
 
     def for_inference(self) -> Self:
         """The same planner on copies of its networks as they are now, in as few operations as possible."""

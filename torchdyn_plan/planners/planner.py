@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from functools import partial
+from typing import Any
 
 import torch
 from tensordict import TensorDictBase
@@ -11,9 +12,9 @@ from torch import Tensor
 from torch.func import debug_unwrap
 
 from torchdyn_plan import keys
-from torchdyn_plan.checks import check_trailing_shape, hides_values
+from torchdyn_plan.checks import check_trailing_shape
 from torchdyn_plan.nets.forecast import Forecast, ForecastModel
-from torchdyn_plan.planners.judging import act, judge
+from torchdyn_plan.planners.judging import GOOD, LARGEST, act, judge
 from torchdyn_plan.planners.observation import SEEN_BY_ALL, Observation
 from torchdyn_plan.planners.parts import ComposedPlanner
 from torchdyn_plan.planners.plan import Plan, input_status, usable_path
@@ -37,7 +38,9 @@ class DynamicPlanner(ComposedPlanner):
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         """Plan where a plan is due, and act; raises `InputError` for a missing key or a wrong shape."""
         seen = observe(tensordict, self.forecaster)
-        obs, found = judge(seen, tensordict, self.read_by_static, self.memory.names)
+        obs, found = seen, GOOD
+        if not are_sane(tensordict, self.in_keys):
+            obs, found = judge(seen, tensordict, self.read_by_static, self.memory.names)
         # Not the clean one: a row that begins without being seen must not remember zeros for its place.
         clock, plan, state, pending = self.memory.recall(tensordict, seen, found.spoiled)
         busy = None
@@ -67,15 +70,18 @@ class DynamicPlanner(ComposedPlanner):
         self.memory.remember(tensordict, (ticked, plan, state, pending), replanned=planned, status=status)
         tensordict.set(keys.GOAL, goal)
         tensordict.set(keys.ARRIVAL_STEPS, plan.arrival_steps)
-        return act(self.static, tensordict, found.blind)
+        return self.static(tensordict) if found.blind is None else act(self.static, tensordict, found.blind)
 
     def replan(self, observation: Observation, plan: Plan) -> Plan:
         """A new plan for every row, from what is seen and the plan in use: pure, and the one entry to planning."""
         delay = 0 if self.delivery is None else self.delivery.delay
-        forecast = self.forecaster.predict(*observation.seen)
+        forecaster, eta_model = self.forecaster, self.eta
+        if self.prepared is not None and self.prepared.stands_for(observation.robot_state, *observation.seen):
+            forecaster, eta_model = self.prepared.copies
+        forecast = forecaster.predict(*observation.seen)
         path, usable = usable_path(forecast.path, observation.target_pos)
         forecast, target_pos = Forecast(path, forecast.spread), observation.target_pos
-        eta, planned_steps = self.eta.from_state(observation.robot_state), plan.arrival_steps
+        eta, planned_steps = eta_model.from_state(observation.robot_state), plan.arrival_steps
         if delay:
             # From here on all is counted from when the plan comes into use.
             forecast, eta = forecast.after(delay), later(eta, delay)
@@ -111,6 +117,25 @@ def observe(tensordict: TensorDictBase, forecaster: ForecastModel) -> Observatio
     return Observation(tool_pos, target_pos, robot_state, step_count, tuple(seen))
 
 
+def are_sane(tensordict: TensorDictBase, read: Sequence[Any]) -> bool:
+    """Whether all entries ``read`` that are there can be looked at, and hold what measurements can be: numbers.
+
+    One quick look passes nearly always; `judge` says row by row what is wrong.
+    """
+    plan = tensordict.get(keys.PLAN, None)
+    # A plain dictionary: a nested look-up takes as long as a small operation.
+    stored = {} if plan is None else dict(plan.items())
+    found = [tensordict.get(key, None) if isinstance(key, str) else stored.get(key[-1]) for key in read]
+    values = [value for value in found if value is not None]
+    if torch.compiler.is_compiling() or any(debug_unwrap(value) is not value for value in values):
+        return False
+    flat = torch.cat([value.reshape(-1) for value in values if value.is_floating_point()])
+    if not len(flat):
+        return True
+    low, high = torch.aminmax(flat)
+    return low.item() >= -LARGEST and high.item() <= LARGEST
+
+
 def replan_rows(
     replan: Callable[[Observation, Plan], Plan],
     rows: Tensor,
@@ -132,13 +157,11 @@ def replan_rows(
     """
     # Planning reads no old path: rows are gathered without it.
     bare = plan._replace(path=plan.path[..., :0, :])
-    if not hides_values(rows):
-        if not rows.any():
-            return others
-        # Models are given one batch dimension, whatever the planner has.
-        if chunk is None and rows.ndim == 1 and rows.all():
-            made = replan(observation, bare)
-            return Plan(*(new.to(old.dtype) for new, old in zip(made, others, strict=True)))
+    # Models are given one batch dimension, whatever the planner has.
+    plain = chunk is None and rows.ndim == 1 and not torch.compiler.is_compiling() and debug_unwrap(rows) is rows
+    if plain and rows.all():
+        made = replan(observation, bare)
+        return Plan(*(new.to(old.dtype) for new, old in zip(made, others, strict=True)))
     count = len(bare)
 
     def flat(*tensors: Tensor) -> Plan:

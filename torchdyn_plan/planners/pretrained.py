@@ -119,7 +119,7 @@ def _ready(planner: Any, given: Mapping[str, Any]) -> Any:
     for name, module in planner.named_children():
         if name not in given:
             module.eval().requires_grad_(False)
-    return planner
+    return planner.prepare()
 
 
 def describe_planner(planner: Any, save: Callable[[Pretrained], str]) -> dict[str, Any]:

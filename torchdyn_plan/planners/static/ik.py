@@ -12,7 +12,7 @@ from torch import Tensor, nn
 from torch.func import debug_unwrap
 
 from torchdyn_plan import keys
-from torchdyn_plan.checks import check_finite, check_number, check_trailing_shape, hides_values
+from torchdyn_plan.checks import check_finite, check_number, check_trailing_shape
 from torchdyn_plan.errors import InputError
 from torchdyn_plan.kinematics.arm import Arm
 from torchdyn_plan.kinematics.components import Vector, damped_least_squares
@@ -190,7 +190,8 @@ class IKPlanner(Precise, StaticPlannerModule):
         wanted = limited_step(whole, limit, self.gain)
         step = torch.clamp(wanted, low, high)
         # Where nothing was cut off, no joint is pushed out of its limits.
-        if hides_values(step) or not torch.equal(step, wanted):
+        plain = not torch.compiler.is_compiling() and debug_unwrap(step) is step
+        if not (plain and torch.equal(step, wanted)):
             whole = self._without_held(whole, rows, error, low, high)
             step = torch.clamp(limited_step(whole, limit, self.gain), low, high)
         return (step / limit).clamp(-1.0, 1.0), joint_pos + step
