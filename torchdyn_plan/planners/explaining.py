@@ -57,8 +57,8 @@ def find_fault(tensordict: Any, read: Sequence[Any], reader: str) -> Fault | Non
         return Fault("tensordict", sentence)
     batch, sizes = tuple(tensordict.batch_size), {key.name: key.shape for key in keys.KEYS}
     for key in read:
-        value = tensordict.get(key, None)
-        if value is None or not isinstance(key, str):
+        value = tensordict.get(key, None) if isinstance(key, str) else None
+        if value is None:
             continue
         if not isinstance(value, Tensor) or value.layout != torch.strided or value.is_meta:
             return Fault(key, f"{key} must be a tensor that holds numbers, got {_kind(value)}")
