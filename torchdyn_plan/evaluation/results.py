@@ -162,6 +162,8 @@ class ResultRow:
     """Mean number of re-plans an episode."""
     failures: dict[str, float]
     """Cause to share of all episodes; empty for a task that names none."""
+    measures: dict[str, float | None]
+    """The task's further figures, by name; empty for a task that has none."""
     episodes_per_second: float | None
     paper_success: float | None
     """The paper's success rate over all episodes at this setting; None where it has none."""
@@ -196,6 +198,7 @@ def summarize(outcomes: EpisodeOutcomes, *, task: Task, planner: str, static: st
         steps_to_success=outcomes.steps[success].double().mean().item() if bool(success.any()) else None,
         replans=outcomes.replans.double().mean().item(),
         failures=failure_shares(outcomes),
+        measures={} if task.measure is None else task.measure(outcomes),
         episodes_per_second=outcomes.episodes / outcomes.seconds if outcomes.seconds > 0 else None,
         paper_success=paper[0],
         paper_success_solvable=paper[1],

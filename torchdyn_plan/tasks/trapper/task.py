@@ -164,6 +164,13 @@ def judge(settings: TrapperSettings, log: Any, truth: Truth) -> Verdict:
     return judge_episodes(log, truth)
 
 
+def measure(outcomes: Any) -> dict[str, float | None]:
+    """As `Task.measure` says: how far the joints pass their speed limits."""
+    from torchdyn_plan.tasks.trapper.causes import measure
+
+    return measure(outcomes)
+
+
 def record_paths(blocks: Any, **how: Any) -> dict[str, Any]:
     """As `Task.record_paths` says: balls rolled alone."""
     from torchdyn_plan.tasks.trapper.data import record_rolls
@@ -227,6 +234,7 @@ TASK = Task(
     truth=truth,
     causes=("unreachable", "planner_too_slow", "forecast", "eta", "early_contact", "pocketed", "late"),
     judge=judge,
+    measure=measure,
     record_paths=record_paths,
     record_arrivals=record_arrivals,
     fitting=fitting,
