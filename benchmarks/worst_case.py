@@ -132,8 +132,9 @@ class Collector:
 
 
 def told(wall: torch.Tensor, running: torch.Tensor, switched: torch.Tensor, collected: torch.Tensor) -> Row:
-    """Figures of calls, by the clock on the wall unless they say otherwise: also their ``running`` time, how often they
-    were ``switched`` off, and for how long Python ``collected`` garbage meanwhile.
+    """Figures of calls, by the clock on the wall unless they say otherwise.
+
+    Beside: their ``running`` time, how often they were ``switched`` off, how long Python ``collected`` garbage.
     """
     points = torch.quantile(wall[: 2**24], torch.tensor([0.5, 0.99, 0.999], dtype=wall.dtype)).mul(1e6).tolist()
     late = wall > STEP

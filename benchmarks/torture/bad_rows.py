@@ -101,7 +101,7 @@ def _judge(planner: Any, found: Any, usual: Any, spoiled: dict[int, set[Any]]) -
     """What is wrong with what a planner made of a batch with bad rows."""
     good = [row for row in range(ROWS) if row not in spoiled]
     for key in ("action", "goal", "arrival_steps"):
-        if key in found.keys() and key in usual.keys():
+        if found.get(key, None) is not None and usual.get(key, None) is not None:
             if not torch.isfinite(found[key]).all():
                 return f"{key} is no number"
             if not torch.equal(found[key][good], usual[key][good]):

@@ -67,7 +67,9 @@ def _changed(draw: Random, words: list[str]) -> list[str]:
         elif kind == 3:
             words = [*words, draw.choice(OPTIONS), draw.choice(VALUES)]
         elif kind == 4:
-            words = [word for place, word in enumerate(words) if place != (hit := draw.randrange(len(words)))] or [str(hit)]
+            words = [word for place, word in enumerate(words) if place != (hit := draw.randrange(len(words)))] or [
+                str(hit)
+            ]
         else:
             words.insert(draw.randrange(len(words) + 1), draw.choice((*VALUES, *OPTIONS)))
     return words

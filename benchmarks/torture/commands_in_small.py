@@ -51,7 +51,7 @@ def words_of(name: str, out: Path, data: Path) -> list[str]:
 
 
 def start(words: Sequence[str], before: Callable[[], object] = lambda: None) -> None:
-    """The command of ``words``, with small shards and scores, and a checkpoint at every step; for a process of its own."""
+    """The command of ``words`` with small shards and scores and a checkpoint at each step; for a process of its own."""
     from torchdyn_plan.cli import main
     from torchdyn_plan.tasks.fetch_reach.policy import FetchGoalTask
     from torchdyn_plan.tasks.trapper import data
@@ -106,7 +106,11 @@ def untimed(content: Any, place: Path) -> Any:
 
 def differing(one: Mapping[str, Any], other: Mapping[str, Any]) -> list[str]:
     """Names of files that are in but one of two results, or differ."""
-    return sorted(name for name in one.keys() | other.keys() if name not in one or name not in other or _differ(one[name], other[name]))
+    return sorted(
+        name
+        for name in one.keys() | other.keys()
+        if name not in one or name not in other or _differ(one[name], other[name])
+    )
 
 
 def _differ(one: Any, other: Any) -> bool:

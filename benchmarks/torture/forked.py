@@ -1,4 +1,4 @@
-"""A command in a process of its own, which has imported everything already and so begins, and can be killed, at once."""
+"""A command in a process of its own, which has imported everything: it begins at once, and can be killed at once."""
 
 from __future__ import annotations
 
@@ -59,7 +59,7 @@ def _child(call: Callable[[], object], stderr: int) -> int:
     """What the forked process does; returns its exit code."""
     os.dup2(stderr, 2)
     os.dup2(os.open(os.devnull, os.O_WRONLY), 1)
-    sys.stderr, sys.stdout = open(2, "w", closefd=False), open(1, "w", closefd=False)  # noqa: PTH123, SIM115
+    sys.stderr, sys.stdout = open(2, "w", closefd=False), open(1, "w", closefd=False)  # noqa: SIM115
     code: int = 0
     try:
         call()

@@ -20,7 +20,7 @@ MARK = "#written#"
 
 
 def cases(draw: Random, folder: Path, count: int) -> Cases:
-    """For each command a disk that is full at its 1st, 2nd, … write, and one that lets files grow to each of `SIZES`."""
+    """For each command a disk that is full at its 1st, 2nd, … write, and files that end at each of `SIZES`."""
     prepare(folder / "data")
     for name in list(COMMANDS)[: max(1, count // 15)]:
         yield from _fill(folder, name)

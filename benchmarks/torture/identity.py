@@ -32,7 +32,7 @@ CONFIG: dict[str, Any] = {
 """What was run, as results tell it."""
 WHOLE = 60
 """Of so many cases one is of two commands that write into one folder."""
-COMMAND = "evaluate --planners pursuit --episodes 1 --num-envs 1 --threads 1 --velocity 1".split()
+COMMAND = ("evaluate", "--planners", "pursuit", "--episodes", "1", "--num-envs", "1", "--velocity", "1")
 OTHERS = {
     "--episodes": ("2", True),
     "--velocity": ("2", True),

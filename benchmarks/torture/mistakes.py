@@ -180,8 +180,9 @@ def make_mistakes(name: str, changes: Sequence[tuple[Any, str]], whole: str) -> 
         if isinstance(made, torch.Tensor) and made.shape[:1] != td.batch_size:
             # A tensordict without a batch size takes what one of four rows refuses.
             td.batch_size = torch.Size(())
-            for nested in [one for one in td.keys() if not isinstance(td.get(one), torch.Tensor)]:
-                td.get(nested).batch_size = torch.Size(())
+            for nested in td.values():
+                if not isinstance(nested, torch.Tensor):
+                    nested.batch_size = torch.Size(())
         td[key] = made
     return WHOLE[whole](td)
 

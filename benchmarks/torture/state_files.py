@@ -21,7 +21,9 @@ from torchdyn_plan.tasks import load_task
 from torchdyn_plan.training.checkpoint import read_checkpoint, write_checkpoint
 from torchdyn_plan.training.optimise import Progress
 
-WORDS = "sweep --over velocity --values 1 3 --planners pursuit --episodes 2 --repeats 1 --threads 1 --out".split()
+SIZES = ("--episodes", "2", "--repeats", "1", "--threads", "1")
+WORDS = ("sweep", "--over", "velocity", "--values", "1", "3", "--planners", "pursuit", *SIZES, "--out")
+"""Of the sweep."""
 WHOLE = 40
 """Of so many cases one is a whole sweep that goes on from a damaged folder."""
 
@@ -85,9 +87,7 @@ def _readers(draw: Random, swept: Path, count: int) -> Cases:
         file = swept.parent / "read" / str(number % len(readers)) / name
         file.parent.mkdir(parents=True, exist_ok=True)
         text = json.dumps(content).encode()
-        file.write_bytes(
-            damaged_bytes(draw, text) if draw.random() < 0.3 else json_bytes(damaged_json(draw, content))
-        )
+        file.write_bytes(damaged_bytes(draw, text) if draw.random() < 0.3 else json_bytes(damaged_json(draw, content)))
         outcome = attempt(read, file)
         fault = outcome.foreign or (_believed(outcome) if name == "episodes.json" else None)
         yield None if fault is None else f"{name}: {fault} ({file.read_bytes()[:300]!r})"

@@ -51,7 +51,7 @@ def _with_streams(words: list[str], what: str) -> tuple[int, bytes]:
     reading, writing = os.pipe()
     os.close(reading)
     streams: dict[str, int | IO[bytes]] = {"stdout": writing, "stderr": subprocess.PIPE}
-    shell = {"no stdout": "exec \"$@\" >&-", "no stderr": "exec \"$@\" 2>&-", "stderr closed too": "exec \"$@\" >&- 2>&-"}
+    shell = {"no stdout": 'exec "$@" >&-', "no stderr": 'exec "$@" 2>&-', "stderr closed too": 'exec "$@" >&- 2>&-'}
     command = _command(words)
     if what in shell:
         streams["stdout"] = subprocess.PIPE

@@ -100,7 +100,9 @@ def _paths(episodes: Tensor, seed: int, scene: str) -> dict[str, Tensor]:
 
 
 def _arrivals(count: int, seed: int, scene: str, planner: Any) -> dict[str, Tensor]:
-    state = torch.full((count, 3), float(seed % 1000) + (0.5 if scene != SCENE else 0.0) + (0.25 if planner == "rl" else 0.0))
+    state = torch.full(
+        (count, 3), float(seed % 1000) + (0.5 if scene != SCENE else 0.0) + (0.25 if planner == "rl" else 0.0)
+    )
     return {"robot_state": state, "goal": state, "arrival": torch.ones(count), "run": torch.arange(count)}
 
 

@@ -24,9 +24,7 @@ MOST = 512 * 2**20
 def cases(draw: Random, folder: Path, count: int) -> Cases:
     """Damaged files: three quarters of networks, the rest of planners."""
     networks: dict[str, Any] = {
-        "forecaster": Forecaster(
-            ForecasterConfig(history=4, horizon=10, channels=4, convolutions=1, hidden=8, rank=4)
-        ),
+        "forecaster": Forecaster(ForecasterConfig(history=4, horizon=10, channels=4, convolutions=1, hidden=8, rank=4)),
         "eta": ETANetwork(ETAConfig(robot_state_size=15, bins=12, hidden=8)),
         "policy": Actor(PolicyConfig(robot_state_size=15, action_size=6, hidden=8, layers=1)),
     }
@@ -78,10 +76,8 @@ def _damaged(draw: Random, whole: bytes) -> bytes:
 
 
 def _planner(draw: Random, folder: Path, text: bytes) -> str | None:
-    if draw.random() < 0.3:
-        content = damaged_bytes(draw, text)
-    else:
-        content = json_bytes(damaged_json(draw, json.loads(text)))
+    anyhow = draw.random() < 0.3
+    content = damaged_bytes(draw, text) if anyhow else json_bytes(damaged_json(draw, json.loads(text)))
     (folder / "planner.json").write_bytes(content)
     outcome = attempt(DynamicPlanner.from_pretrained, folder)
     return None if outcome.foreign is None else f"planner: {outcome.foreign}"

@@ -84,7 +84,7 @@ class TraceLog:
 
 
 def _shown(observed: TensorDictBase) -> list[Tensor]:
-    """What an environment shows of robots and targets: places (N, 3) each, and the speed of the fastest joint (N, 1)."""
+    """What an environment shows: where robots and targets are, (N, 3) each, and the fastest joint's speed (N, 1)."""
     tool_pos: Tensor = observed.get(keys.TOOL_POS)
     joint_vel = observed.get(keys.JOINT_VEL, None)
     speed = torch.zeros_like(tool_pos[:, :1]) if joint_vel is None else joint_vel.abs().amax(-1, keepdim=True)

@@ -35,7 +35,9 @@ def record(*, plans=((20, PLACE, MET, True),), tool=((0.0, 0.5, 0.3),) * STEPS, 
         planned[:, made] = True
     path = rolling() if path is None else path
     still = torch.zeros(1, STEPS)
-    return Trace(torch.tensor([tool]), path[:, :STEPS], goal, arrival, planned, reachable, torch.tensor([length]), still)
+    return Trace(
+        torch.tensor([tool]), path[:, :STEPS], goal, arrival, planned, reachable, torch.tensor([length]), still
+    )
 
 
 def tool_at(place, since):
