@@ -86,5 +86,5 @@ def _left(place: Path, ended: forked.Ended) -> str | None:
 PROMISE = Promise(
     says="a command with any words ends, with exit 0, or 2 and one line of why, and leaves no empty folders",
     cases=cases,
-    count=1200,
+    count=600,
 )

@@ -182,5 +182,5 @@ def _expected(stem: str, asked: dict[str, Any]) -> list[dict[str, Tensor]]:
 PROMISE = Promise(
     says="a training reads what the descriptions of its data say, to the last number, or refuses by name",
     cases=cases,
-    count=3000,
+    count=2000,
 )
