@@ -79,7 +79,7 @@ TORTURE = {
     "state_files": 12,
     "training_data": 20,
     "identity": 20,
-    "folders": 40,
+    "folders": 12,
 }
 """Fewest cases of each promise that is tried in its own process, at a hundredth of the size."""
 

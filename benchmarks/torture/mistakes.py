@@ -106,8 +106,12 @@ GONE = "gone"
 """The entry is left out."""
 
 
+_memmaps = tempfile.TemporaryDirectory(prefix="torture-memmaps-")
+"""Gone when the process ends."""
+
+
 def _memmap(td: Any) -> Any:
-    return td.memmap_(tempfile.mkdtemp(prefix="torture-"))
+    return td.memmap_(tempfile.mkdtemp(dir=_memmaps.name))
 
 
 WHOLE: dict[str, Callable[[Any], Any]] = {
