@@ -11,6 +11,7 @@ from typing import Annotated, Any
 import torch
 from torch import Tensor
 
+from torchdyn_plan.checks import check_finite
 from torchdyn_plan.errors import InputError
 from torchdyn_plan.evaluation.intervals import rate
 from torchdyn_plan.files import check_writable_folder, write_json
@@ -89,6 +90,9 @@ class EpisodeOutcomes:
             check_content(value, schema, "episode outcomes", entry=name)
         tensors = {name: torch.tensor(content[name]) for name in content if name not in {"cause", "seconds"}}
         others = {name: tensor for name, tensor in tensors.items() if name not in own}
+        for name, tensor in others.items():
+            # What is finite in a file may be too large for float32.
+            check_finite(f"episode outcomes: {name}", tensor)
         return cls(
             success=tensors[task.words.success],
             steps=tensors["steps"],
