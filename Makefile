@@ -6,20 +6,24 @@ unexport PYTHONPATH PYTHONHOME
 export PIP_USER := 0
 export UV_PYTHON_DOWNLOADS ?= never
 
-.PHONY: demo test check lock environment clean
+.PHONY: demo test check torture lock environment clean
 
 demo: environment
 	$(BIN)/torchdyn-plan evaluate --static ik --planners pursuit corner oracle wait_and_drop --velocity 3 --episodes 100 --seed 0 --out runs/demo --overwrite
 
 # One thread a worker: two pools of threads on the same cores slow each other down.
 test: environment
-	OMP_NUM_THREADS=1 $(BIN)/pytest -q -n 2
+	OMP_NUM_THREADS=1 $(BIN)/pytest -q -n 2 -m "not slow"
 
 check: environment
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
 	$(BIN)/basedpyright
 	OMP_NUM_THREADS=1 $(BIN)/pytest -q -n 2
+
+# Every promise under hostile users, damaged files, full disks and crashes: half an hour. A killed run goes on.
+torture: environment
+	OMP_NUM_THREADS=1 $(BIN)/python -m benchmarks.torture --out runs/torture.json
 
 # For the oldest Python of the project, whichever runs it.
 lock:

@@ -14,6 +14,7 @@ from torchdyn_plan.tasks import load_task
 BENCHMARKS = Path(__file__).parent.parent / "benchmarks"
 SMALL = {
     "ablation": "--velocities 3 --episodes 2 --num-envs 2 --split dev",
+    "braking": "--episodes 2 --num-envs 2 --threads 1",
     "calibration": "--episodes 8 --pursuit-episodes 8 --split dev",
     "ceiling": "--velocities 5 --episodes 3 --spacing 60 --meetings 1 --leads 7 --rows 64 --split dev",
     "count_calls": "--planners corner --batch 2",
@@ -32,10 +33,10 @@ SMALL = {
     "recovery": "--planners wait_and_drop --statics ik --velocities 5 --episodes 2 --num-envs 2 --split dev",
     "schedules": "--planners wait_and_drop --velocities 3 --schedules paper --episodes 4",
     "static_task": "--episodes 8 --split dev",
+    "worst_case": "--planners corner --statics ik --calls 40 --seconds 1",
 }
 ELSEWHERE = {
     "descriptions",
-    "killed_training",
     "measure_arrivals",
     "nearest",
     "policy_curves",
@@ -82,6 +83,58 @@ def test_a_planning_step_goes_through_few_calls_in_few_files(study):
     assert 40 < plans["calls"] <= 60, plans
     assert plans["files"] <= 12, plans
     assert 20 < between["calls"] <= 30, between
+
+
+TORTURE = {
+    "bad_rows": 66,
+    "bad_actions": 4,
+    "mistakes": 30,
+    "inverse": 64,
+    "weight_files": 40,
+    "state_files": 12,
+    "training_data": 20,
+    "identity": 20,
+    "folders": 12,
+}
+"""Fewest cases of each promise that is tried in its own process, at a hundredth of the size."""
+
+
+def torture(*words):
+    run = [sys.executable, "-m", "benchmarks.torture", *words]
+    return subprocess.run(run, cwd=BENCHMARKS.parent, capture_output=True, text=True, check=False, timeout=500)
+
+
+def test_promises_are_tried_and_a_killed_run_goes_on(tmp_path):
+    out = tmp_path / "torture.json"
+    done = torture("--promises", *TORTURE, "--size", "0.01", "--out", str(out))
+    assert done.returncode == 0, done.stdout + done.stderr
+    content = json.loads(out.read_text())
+    assert content.keys() >= {"machine", "versions", "config", "total"}
+    assert {row["promise"]: row["faults"] for row in content["rows"]} == dict.fromkeys(TORTURE, 0)
+    assert all(row["cases"] >= TORTURE[row["promise"]] for row in content["rows"])
+    before = out.stat().st_mtime_ns
+    again = torture("--promises", *TORTURE, "--size", "0.01", "--out", str(out))
+    assert (again.returncode, out.stat().st_mtime_ns) == (0, before)
+    assert "| a bad row never stops or changes the others" in again.stdout
+    other = torture("--promises", "inverse", "--size", "0.02", "--out", str(out))
+    assert "give another file" in other.stderr
+
+
+def test_a_broken_promise_is_told(monkeypatch, tmp_path):
+    import random
+
+    from benchmarks.torture import bad_actions
+
+    monkeypatch.setattr(bad_actions, "_differing", lambda *_: "it moved")
+    found = bad_actions.PROMISE.run(random.Random(0), tmp_path, 0.001)
+    assert found == {"cases": 2, "faults": 2, "told": ["it moved"] * 2, "seconds": found["seconds"]}
+
+
+def test_no_promise_is_forgotten():
+    from benchmarks.torture.__main__ import PROMISES
+
+    shared = {"__init__", "__main__", "promise", "forked", "damage", "commands_in_small"}
+    assert {file.stem for file in (BENCHMARKS / "torture").glob("*.py")} - shared == set(PROMISES)
 
 
 def test_a_killed_study_goes_on_with_the_rows_in_its_file(study, tmp_path):

@@ -35,6 +35,7 @@ ROW = {
     "steps_to_success",
     "replans",
     "failures",
+    "measures",
     "episodes_per_second",
     "paper_success",
     "paper_success_solvable",

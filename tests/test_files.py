@@ -19,6 +19,7 @@ from torchdyn_plan.files import (
     exists,
     is_file,
     read_json,
+    tensor_bytes,
     write_json,
     write_tensors,
     write_whole,
@@ -201,3 +202,9 @@ def test_what_is_no_json_is_named(tmp_path, text):
     path.write_bytes(text)
     with pytest.raises(InputError, match=r"a\.json' is no JSON file"):
         read_json(path)
+
+
+def test_a_number_of_a_larger_tensor_has_bytes():
+    table = torch.arange(18.0).reshape(2, 9)
+    for tensor in (table[:1, 3], table[0, 3], table[:, 3], table.mT, torch.tensor([], dtype=torch.int64)):
+        assert bytes(tensor_bytes(tensor)) == tensor.numpy().tobytes()

@@ -59,10 +59,11 @@ def write_json(path: Path, content: Any) -> None:
 
 
 def write_tensors(path: Path, tensors: Mapping[str, Tensor], metadata: Mapping[str, str] | None = None) -> None:
-    """Write ``tensors`` to ``path`` as safetensors, whole or not at all."""
+    """Write ``tensors`` to ``path`` as safetensors, whole or not at all; those that share memory are written apart."""
     from safetensors.torch import save_file
 
-    write_whole(path, lambda temporary: save_file(dict(tensors), temporary, None if metadata is None else {**metadata}))
+    apart, about = _apart(tensors), None if metadata is None else {**metadata}
+    write_whole(path, lambda temporary: save_file(apart, temporary, about))
 
 
 def read_json(path: Path, error: type[TorchdynPlanError] = InputError) -> Any:
@@ -93,6 +94,15 @@ def read_tensors(path: Path, error: type[TorchdynPlanError]) -> tuple[dict[str, 
         return content.metadata() or {}, {name: content.get_tensor(name) for name in content.keys()}  # noqa: SIM118
 
 
+def tensor_bytes(tensor: Tensor) -> memoryview:
+    """The numbers of ``tensor`` one after the other, for a digest."""
+    import torch
+
+    # A single number of a larger tensor keeps its stride, and cannot be looked at as bytes: a copy can.
+    flat = tensor.detach().cpu().reshape(-1).clone(memory_format=torch.contiguous_format)
+    return flat.view(torch.uint8).numpy().data
+
+
 @contextlib.contextmanager
 def open_tensors(path: Path, error: type[TorchdynPlanError]) -> Iterator[Any]:
     """The safetensors file at ``path``, of which nothing but the header is read; raises ``error`` if it is damaged."""
@@ -105,6 +115,14 @@ def open_tensors(path: Path, error: type[TorchdynPlanError]) -> Iterator[Any]:
         if isinstance(cause, TorchdynPlanError):
             raise
         raise error(f"{short_path(path)} is not a whole safetensors file: {reason(cause)}") from cause
+
+
+def files_in(folder: Path, pattern: str, error: type[TorchdynPlanError] = InputError) -> list[Path]:
+    """Files in ``folder`` whose names fit ``pattern``, in order; raises ``error`` if it cannot be looked into."""
+    try:
+        return sorted(folder.glob(pattern))
+    except (OSError, ValueError) as cause:
+        raise error(f"folder {short_path(folder)} cannot be read: {reason(cause)}") from cause
 
 
 def exists(path: Path) -> bool:
@@ -227,6 +245,17 @@ def _take(lock: BinaryIO) -> bool | None:
     except OSError:
         return None
     return True
+
+
+def _apart(tensors: Mapping[str, Tensor]) -> dict[str, Tensor]:
+    """``tensors``, each contiguous and in a memory of its own, as safetensors wants them."""
+    apart: dict[str, Tensor] = {}
+    known: set[int] = set()
+    for name, tensor in tensors.items():
+        memory = tensor.untyped_storage().data_ptr()
+        apart[name] = tensor.clone() if memory in known else tensor.contiguous()
+        known.add(memory)
+    return apart
 
 
 def _no_number(word: str) -> Any:

@@ -115,22 +115,19 @@ def _check_scalar(value: Any, schema: Any, entry: str) -> None:
         raise _mismatch(entry, _name(schema), value)
 
 
+def _is_whole(value: Any) -> bool:
+    """Whether it is a whole number; beyond 64 bits it is none that was ever written, and no tensor takes it."""
+    return isinstance(value, int) and not isinstance(value, bool) and abs(value) < 2**63
+
+
 _SCALARS: dict[Any, Callable[[Any], bool]] = {
     bool: lambda value: isinstance(value, bool),
-    # Beyond 64 bits a number is none that was ever written.
-    int: lambda value: isinstance(value, int) and not isinstance(value, bool) and abs(value) < 2**63,
-    float: lambda value: isinstance(value, (int, float)) and not isinstance(value, bool) and _is_finite(value),
+    int: _is_whole,
+    float: lambda value: _is_whole(value) or (isinstance(value, float) and math.isfinite(value)),
     str: lambda value: isinstance(value, str),
     None: lambda value: value is None,
     types.NoneType: lambda value: value is None,
 }
-
-
-def _is_finite(value: float) -> bool:
-    try:
-        return math.isfinite(value)
-    except OverflowError:
-        return False
 
 
 def _fits(value: Any, schema: Any, entry: str) -> bool:

@@ -70,6 +70,8 @@ def test_files_speak_the_tasks_words():
         (lambda content: content.update(steps=[2**80] * 6), r"steps\[0\] must be a whole number"),
         (lambda content: content.update(replans=[-2] * 6), r"replans\[0\] must be a number >= 0, got -2"),
         (lambda content: content.update(pocketed=[True, math.nan] * 3), "pocketed must be"),
+        (lambda content: content.update(forecast_error=[2**70] * 6), "forecast_error must be"),
+        (lambda content: content.update(forecast_error=[1e308] * 6), "forecast_error must be finite, got 6"),
         (lambda content: content.update(cause=["rain"] * 6), "name unknown causes: rain"),
         (lambda content: content.update(steps=[1, 2]), r"outcomes.steps must have shape \(E,\) = \(6,\), got \(2,\)"),
         (lambda content: content.update(solvable=[1] * 6), r"solvable\[0\] must be true or false, got 1"),

@@ -81,10 +81,12 @@ def test_targets_of_singular_configurations_are_solved():
 
 
 def test_a_start_that_is_not_finite_is_named_in_its_row():
-    q0 = configurations(4, 6)
-    q0[2, 3] = math.nan
-    result = solve_ik(ARM, reachable(4), q0=q0)
-    assert result.status.tolist() == [0, 0, IKStatus.INVALID, 0]
+    for bad in (math.nan, math.inf, -math.inf):
+        q0 = configurations(4, 6)
+        q0[2, 3] = bad
+        result = solve_ik(ARM, reachable(4), q0=q0)
+        assert result.status.tolist() == [0, 0, IKStatus.INVALID, 0]
+        assert torch.equal(result.q[2].nan_to_num(7.0), q0[2].nan_to_num(7.0))
 
 
 def test_a_joint_at_its_limit_is_named():

@@ -75,3 +75,45 @@ def test_the_cause_is_kept(seen):
     with pytest.raises(InputError) as caught:
         DynamicPlanner.from_pretrained("trapper-ik")(seen.lock_())
     assert isinstance(caught.value.__cause__, RuntimeError)
+
+
+@pytest.mark.parametrize(
+    ("name", "change", "says"),
+    [
+        ("usable", lambda value: value.double(), r"\('plan', 'usable'\) must hold true or false, got torch.float64"),
+        (
+            "countdown",
+            lambda value: value.to(torch.complex64),
+            "'countdown'\\) must hold whole numbers, got torch",
+        ),
+        ("goal", lambda value: value.to_sparse(), "'goal'\\) must hold floating-point numbers, got torch.sparse_coo"),
+        ("goal", lambda value: "here", "'goal'\\) must hold floating-point numbers, got NonTensorData"),
+        ("path_pos", lambda value: value[..., :-1], r"'path_pos'\) must have shape \(4, 6\), got \(4, 5\)"),
+        ("path_pos", lambda value: value[..., 0], r"'path_pos'\) must have shape \(4, 6\), got \(4,\)"),
+    ],
+)
+def test_a_memory_that_was_changed_is_named(seen, name, change, says):
+    planner = load_task("trapper").planner("exact", "ik")
+    seen = planner(seen)
+    seen["step_count"] += 1
+    seen["plan", name] = change(seen["plan", name])
+    with pytest.raises(InputError, match=says):
+        planner(seen)
+
+
+@pytest.mark.filterwarnings("ignore:a planner remembers nothing")
+@pytest.mark.parametrize(
+    ("change", "says"),
+    [
+        (lambda td: td.to("meta"), "must be a tensor that holds numbers, got on no device, torch.float32"),
+        (lambda td: td.set("step_count", "now"), "step_count must be a tensor that holds numbers, got NonTensorData"),
+        (
+            lambda td: td.exclude("plan").set("plan", torch.zeros(4, 1)),
+            "plan must be a tensordict, a planner's memory",
+        ),
+    ],
+    ids=["meta", "text", "plan"],
+)
+def test_what_holds_no_numbers_is_named(seen, change, says):
+    with pytest.raises(InputError, match=says):
+        load_task("trapper").planner("corner", "ik")(change(seen))

@@ -251,3 +251,48 @@ def test_paths_that_do_not_lie_end_to_end_are_refused(tmp_path, change):
     save_file(load_file(file) | change, file, made)
     with pytest.raises(InputError, match=re.escape(str(tmp_path))):
         load_paths(tmp_path)
+
+
+def test_a_shard_under_another_name_is_refused(tmp_path):
+    gather(tmp_path, episodes=12)
+    first, second = sorted(tmp_path.glob("paths-*.safetensors"))
+    second.write_bytes(first.read_bytes())
+    says = r"paths-0-001.* is the shard paths-0-000 under another name: delete it"
+    with pytest.raises(InputError, match=says):
+        fits(tmp_path, "paths")
+    with pytest.raises(InputError, match=says):
+        gather(tmp_path, episodes=12)
+
+
+def test_a_shard_whose_numbers_were_changed_is_refused(tmp_path):
+    gather(tmp_path, episodes=6)
+    file = tmp_path / "paths-0-000.safetensors"
+    content = bytearray(file.read_bytes())
+    content[-1] ^= 1
+    file.write_bytes(content)
+    with pytest.raises(InputError, match=r"paths-0-000.* is damaged: it holds something else than was written"):
+        load_paths(tmp_path)
+
+
+def test_a_description_under_another_name_is_refused(tmp_path):
+    gather(tmp_path, episodes=6)
+    (tmp_path / "paths-3.json").write_bytes((tmp_path / "paths-0.json").read_bytes())
+    with pytest.raises(InputError, match=r"paths-3.json' describes another series, whose description is paths-0.json"):
+        fits(tmp_path, "paths")
+
+
+def test_tensors_that_share_memory_are_written(tmp_path):
+    def record(planner, **how):
+        made = record_arrivals(planner, **how)
+        return made | {"robot_state": made["goal"]}
+
+    (shard,) = gather(tmp_path, "arrivals", replace(TASK, record_arrivals=record))
+    assert torch.equal(shard["robot_state"], shard["goal"])
+
+
+@pytest.mark.parametrize("name", ["x" * 300, "loop"])
+def test_a_folder_that_cannot_be_read_is_named(tmp_path, name):
+    if name == "loop":
+        (tmp_path / name).symlink_to(tmp_path / name)
+    with pytest.raises(InputError, match=name[:9]):
+        fits(tmp_path / name, "paths")

@@ -13,6 +13,7 @@ from typing import Annotated, Any
 import torch
 from torch import Tensor
 
+from torchdyn_plan.checks import check_finite
 from torchdyn_plan.errors import InputError
 from torchdyn_plan.evaluation.intervals import rate
 from torchdyn_plan.files import check_writable_folder, write_json
@@ -91,6 +92,9 @@ class EpisodeOutcomes:
             check_content(value, schema, "episode outcomes", entry=name)
         tensors = {name: torch.tensor(content[name]) for name in content if name not in {"cause", "seconds"}}
         others = {name: tensor for name, tensor in tensors.items() if name not in own}
+        for name, tensor in others.items():
+            # What is finite in a file may be too large for float32.
+            check_finite(f"episode outcomes: {name}", tensor)
         return cls(
             success=tensors[task.words.success],
             steps=tensors["steps"],
@@ -164,6 +168,8 @@ class ResultRow:
     """Mean number of re-plans an episode."""
     failures: dict[str, float]
     """Cause to share of all episodes; empty for a task that names none."""
+    measures: dict[str, float | None]
+    """The task's further figures, by name; empty for a task that has none."""
     episodes_per_second: float | None
     paper_success: float | None
     """The paper's success rate over all episodes at this setting; None where it has none."""
@@ -204,6 +210,7 @@ def summarize(outcomes: EpisodeOutcomes, *, task: Task, planner: str, static: st
         steps_to_success=outcomes.steps[success].double().mean().item() if bool(success.any()) else None,
         replans=outcomes.replans.double().mean().item(),
         failures=failure_shares(outcomes),
+        measures={} if task.measure is None else task.measure(outcomes),
         episodes_per_second=outcomes.episodes / outcomes.seconds if outcomes.seconds > 0 else None,
         paper_success=paper[0],
         paper_success_solvable=paper[1],

@@ -28,6 +28,12 @@ class Trace(NamedTuple):
     """``(R, T)`` bool: the robot can be in time for the meeting, by the plan in force."""
     length: Tensor
     """``(R,)`` int64: the step at which the episode ended."""
+    joint_speed: Tensor
+    """``(R, T)`` of the fastest joint [rad/s]; 0 of a robot that shows no joints."""
+
+
+COLUMNS = 13
+"""Numbers of a record at each step: those of `Trace` but the length."""
 
 
 class TraceLog:
@@ -36,7 +42,7 @@ class TraceLog:
     def __init__(self, max_steps: int) -> None:
         """Room for episodes of up to ``max_steps`` control steps."""
         self._max_steps = max_steps
-        self._record: Tensor = torch.empty(0, max_steps + 1, 12)
+        self._record: Tensor = torch.empty(0, max_steps + 1, COLUMNS)
         self._ended: list[Tensor] = []
         self._lengths: list[Tensor] = []
 
@@ -45,7 +51,7 @@ class TraceLog:
         tool_pos: Tensor = stepped.get(keys.TOOL_POS)
         step: Tensor = stepped.get(keys.STEP_COUNT).squeeze(-1)
         if len(self._record) != len(step):
-            self._record = torch.empty(len(step), self._max_steps + 1, 12)
+            self._record = torch.empty(len(step), self._max_steps + 1, COLUMNS)
             self._rows = torch.arange(len(step))
         plan = stepped.get(keys.PLAN, None)
         if plan is None or plan.get("replanned", None) is None:
@@ -54,7 +60,7 @@ class TraceLog:
         else:
             goal, *numbers = map(plan.get, ("goal", "arrival_steps", "replanned", "reachable"))
             numbers = torch.stack(numbers, dim=-1)
-        entries = torch.cat([tool_pos, stepped[keys.TARGET_POS], goal, numbers], dim=-1)
+        entries = torch.cat([*_shown(stepped), goal, numbers], dim=-1)
         self._record[self._rows, step] = entries.to(self._record.dtype)
 
     def end(self, stepped: TensorDictBase, rows: Tensor) -> None:
@@ -62,8 +68,8 @@ class TraceLog:
         after: TensorDictBase = stepped.get("next")
         length = after[keys.STEP_COUNT].squeeze(-1)[rows]
         record = self._record[rows]
-        last = torch.cat([after[keys.TOOL_POS][rows], after[keys.TARGET_POS][rows]], dim=-1)
-        record[torch.arange(len(rows)), length, :6] = last.to(record.dtype)
+        last = torch.cat(_shown(after), dim=-1)[rows]
+        record[torch.arange(len(rows)), length, : last.shape[-1]] = last.to(record.dtype)
         self._ended.append(record)
         self._lengths.append(length)
 
@@ -77,7 +83,15 @@ class TraceLog:
         ]
 
 
+def _shown(observed: TensorDictBase) -> list[Tensor]:
+    """What an environment shows: where robots and targets are, (N, 3) each, and the fastest joint's speed (N, 1)."""
+    tool_pos: Tensor = observed.get(keys.TOOL_POS)
+    joint_vel = observed.get(keys.JOINT_VEL, None)
+    speed = torch.zeros_like(tool_pos[:, :1]) if joint_vel is None else joint_vel.abs().amax(-1, keepdim=True)
+    return [tool_pos, observed.get(keys.TARGET_POS), speed]
+
+
 def _split(record: Tensor, length: Tensor) -> Trace:
-    tool_pos, target_pos, goal, arrival, planned, reachable = record.split([3, 3, 3, 1, 1, 1], dim=-1)
-    planned, reachable = planned.squeeze(-1) > 0, reachable.squeeze(-1) > 0
-    return Trace(tool_pos, target_pos, goal, arrival.squeeze(-1).long(), planned, reachable, length)
+    tool_pos, target_pos, *others = record.split([3, 3, 1, 3, 1, 1, 1], dim=-1)
+    speed, goal, arrival, planned, reachable = (others[0].squeeze(-1), others[1], *(o.squeeze(-1) for o in others[2:]))
+    return Trace(tool_pos, target_pos, goal, arrival.long(), planned > 0, reachable > 0, length, speed)

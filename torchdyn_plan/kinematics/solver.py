@@ -174,13 +174,13 @@ def joint_numbers(name: str, value: float | Tensor, arm: Arm) -> Tensor:
 def inside_limits(arm: Arm, q: Tensor) -> Tensor:
     """``q`` (*B, N) within the limits: the same pose where whole turns bring it there, else the nearest position.
 
-    What is not finite stays so.
+    What is NaN or infinite is nowhere near, and becomes NaN.
     """
-    q, turns = reduced(arm, q), revolute(arm)
+    known, q, turns = q.isfinite(), reduced(arm, q), revolute(arm)
     outside = torch.maximum(arm.lower - q, q - arm.upper)
     turned = turned_towards(q, torch.clamp(q, arm.lower, arm.upper), arm.lower, arm.upper)
     q = torch.where(turns & (outside > OVERSHOOT), turned, q)
-    return torch.where(q.isfinite(), torch.clamp(q, arm.lower, arm.upper), q)
+    return torch.clamp(q, arm.lower, arm.upper).masked_fill(~known, torch.nan)
 
 
 def _limits(arm: Arm, start: Tensor | None, max_move: float | Tensor | None) -> tuple[Tensor, Tensor]:

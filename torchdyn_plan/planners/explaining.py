@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import Any, NamedTuple
 
+import torch
 from tensordict import TensorDictBase
 from torch import Tensor
 
@@ -17,7 +18,7 @@ COUNTS = (keys.STEP_COUNT, keys.HISTORY_LENGTH, keys.EPISODE)
 
 def explain(error: Exception, planner: Any, tensordict: Any) -> InputError | None:
     """What is wrong with the ``tensordict`` on which a ``planner`` failed with ``error``; None if it is not that."""
-    fault = find_fault(tensordict, planner.in_keys, type(planner).__name__)
+    fault = find_fault(tensordict, planner.in_keys, type(planner).__name__) or find_memory_fault(tensordict, planner)
     # An error of our own that names the entry says more of it.
     named = isinstance(error, TorchdynPlanError) and fault is not None and fault.name in str(error)
     return None if fault is None or named else InputError(fault.sentence)
@@ -40,9 +41,11 @@ def find_fault(tensordict: Any, read: Sequence[Any], reader: str) -> Fault | Non
         return Fault("tensordict", sentence)
     batch, sizes = tuple(tensordict.batch_size), {key.name: key.shape for key in keys.KEYS}
     for key in read:
-        value = tensordict.get(key, None)
-        if not isinstance(value, Tensor):
+        value = tensordict.get(key, None) if isinstance(key, str) else None
+        if value is None:
             continue
+        if not isinstance(value, Tensor) or value.layout != torch.strided or value.is_meta:
+            return Fault(key, f"{key} must be a tensor that holds numbers, got {_kind(value)}")
         if key in sizes and not value.is_floating_point() and (key not in COUNTS or value.is_complex()):
             return Fault(key, f"{key} must hold floating-point numbers, got {value.dtype}")
         expected, shape = sizes.get(key), tuple(value.shape)
@@ -50,6 +53,42 @@ def find_fault(tensordict: Any, read: Sequence[Any], reader: str) -> Fault | Non
             wanted = ", ".join(map(str, (*batch, *expected)))
             return Fault(key, f"{key} must have shape ({wanted}) in a tensordict of batch size {batch}, got {shape}")
     return None
+
+
+def find_memory_fault(tensordict: TensorDictBase, planner: Any) -> Fault | None:
+    """Why ``planner`` cannot go on from what lies below ``plan`` in ``tensordict``; None if it can."""
+    plan, batch = tensordict.get(keys.PLAN, None), tuple(tensordict.batch_size)
+    remedy = "leave what a planner has written there as it is, or take all of it away"
+    if plan is None:
+        return None
+    if not isinstance(plan, TensorDictBase):
+        return Fault(keys.PLAN, f"{keys.PLAN} must be a tensordict, a planner's memory, got {_kind(plan)}: {remedy}")
+    for name, like in planner.empty_memory(torch.zeros(3)).items():
+        value, place = plan.get(name, None), f"({keys.PLAN!r}, {name!r})"
+        if value is None:
+            continue
+        shape, kind = (*batch, *like.shape), _number_kind(like)
+        if not isinstance(value, Tensor) or value.layout != torch.strided or _number_kind(value) != kind:
+            return Fault(name, f"{place} must hold {kind}, got {_kind(value)}: {remedy}")
+        if tuple(value.shape) != shape:
+            return Fault(name, f"{place} must have shape {shape}, got {tuple(value.shape)}: {remedy}")
+    return None
+
+
+def _kind(value: Any) -> str:
+    """What ``value`` is, in a few words."""
+    if not isinstance(value, Tensor):
+        return type(value).__name__
+    where = "on no device, " if value.is_meta else ""
+    return f"{where}{value.dtype}" if value.layout == torch.strided else f"{value.layout}, {value.dtype}"
+
+
+def _number_kind(value: Tensor) -> str:
+    if value.dtype == torch.bool:
+        return "true or false"
+    if value.is_complex():
+        return "complex numbers"
+    return "floating-point numbers" if value.is_floating_point() else "whole numbers"
 
 
 def _fits(shape: tuple[int, ...], batch: tuple[int, ...], expected: tuple[str | int, ...]) -> bool:

@@ -24,6 +24,7 @@ from torchdyn_plan.files import (
     no_empty_folders,
     read_json,
     short_path,
+    tensor_bytes,
     write_json,
     write_whole,
 )
@@ -140,7 +141,7 @@ def planner_digest(planner: Any) -> str | None:
         told.update(f"{_path_of(type(module))} {json.dumps(settings, sort_keys=True)}".encode())
     for name, tensor in planner.state_dict().items():
         told.update(f"{name} {tensor.dtype} {tuple(tensor.shape)}".encode())
-        told.update(tensor.detach().cpu().contiguous().view(-1).view(torch.uint8).numpy().tobytes())
+        told.update(tensor_bytes(tensor))
     return told.hexdigest()[:16]
 
 

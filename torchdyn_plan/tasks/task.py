@@ -179,6 +179,9 @@ class Task:
     """Names of the causes of failure, in the order in which they are asked."""
     judge: Callable[..., Verdict] | None = None
     """``(settings, log, truth)``, with the `torchdyn_plan.evaluation.episodes.EpisodeLog`, to why episodes failed."""
+    measure: Callable[[Any], dict[str, float | None]] | None = None
+    """The `torchdyn_plan.evaluation.results.EpisodeOutcomes` to further figures of them, by name; None of a figure that
+    they do not tell."""
     record_paths: Callable[..., dict[str, Tensor]] | None = None
     """``(blocks, *, seed, num_threads)`` to the paths of targets that nobody touches, of the episodes in ``blocks``
     (tensors of their numbers), laid end to end: ``positions start length pocketed velocity``."""

@@ -10,7 +10,7 @@ import torch
 from torch import Tensor, nn
 
 from torchdyn_plan.errors import TrainingError
-from torchdyn_plan.files import parse_json, read_tensors, reason, short_path, write_tensors
+from torchdyn_plan.files import parse_json, read_tensors, reason, short_path, tensor_bytes, write_tensors
 from torchdyn_plan.schemas import check_content
 
 FORMAT = "torchdyn_plan.checkpoint.2"
@@ -129,7 +129,7 @@ def _digest(metadata: Mapping[str, str], tensors: Mapping[str, Tensor]) -> str:
         told.update(f"{name} {metadata[name]} ".encode())
     for name, tensor in sorted(tensors.items()):
         told.update(f"{name} {tensor.dtype} {tuple(tensor.shape)} ".encode())
-        told.update(tensor.reshape(-1).view(torch.uint8).numpy().data)
+        told.update(tensor_bytes(tensor))
     return told.hexdigest()
 
 

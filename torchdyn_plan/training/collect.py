@@ -20,7 +20,7 @@ from torchdyn_plan.progress import progress_bar
 from torchdyn_plan.tasks.task import Task, load_task
 from torchdyn_plan.threads import one_thread
 from torchdyn_plan.training import shards
-from torchdyn_plan.training.shards import check_made, shard_path, shard_sizes, surplus_shards
+from torchdyn_plan.training.shards import check_made, content_digest, shard_path, shard_sizes, surplus_shards
 from torchdyn_plan.versions import library_versions
 
 ENTRIES = {
@@ -87,7 +87,7 @@ def collect(
             if exists(path) and not check_made(path, made):
                 continue
             tensors = _whole(wanted, record(index))
-            write_tensors(path, tensors, made)
+            write_tensors(path, tensors, made | {"shard": path.stem, "content": content_digest(tensors)})
     about = {"arguments": asdict(wanted), "scene": task.digest(), "versions": library_versions()}
     write_json(out / f"{what}-{seed}.json", about)
 

@@ -2,14 +2,15 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import hashlib
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any, TypedDict
 
 from torch import Tensor
 
 from torchdyn_plan.errors import InputError
-from torchdyn_plan.files import read_json, read_metadata, read_tensors, short_path
+from torchdyn_plan.files import files_in, read_json, read_metadata, read_tensors, short_path, tensor_bytes
 from torchdyn_plan.schemas import Count, Positive, check_content
 
 SHARD = {"paths": 1024, "arrivals": 2048}
@@ -47,7 +48,7 @@ def shard_sizes(stem: str, episodes: int) -> list[int]:
 def surplus_shards(folder: Path, stem: str, seed: int, count: int) -> list[Path]:
     """Shards of series ``seed`` in ``folder`` that are none of its first ``count``."""
     known = {shard_path(folder, stem, seed, index) for index in range(count)}
-    return sorted(set(folder.glob(f"{stem}-{seed}-*.safetensors")) - known)
+    return sorted(set(files_in(folder, f"{stem}-{seed}-*.safetensors")) - known)
 
 
 def read_description(data: Path, stem: str, *, scene: str) -> dict[str, Any]:
@@ -66,7 +67,7 @@ def read_description(data: Path, stem: str, *, scene: str) -> dict[str, Any]:
             the next, or the shards are not those that it tells of.
     """
     data = Path(data)
-    files = sorted(data.glob(f"{stem}-*.json"))
+    files = files_in(data, f"{stem}-*.json")
     if not files:
         raise InputError(f"no {stem}-*.json in {short_path(data)}: its collection did not finish")
     arguments: list[dict[str, Any]] = []
@@ -78,9 +79,12 @@ def read_description(data: Path, stem: str, *, scene: str) -> dict[str, Any]:
             raise InputError(
                 f"{short_path(file)} tells of scene {about['scene']}, but the scene is {scene}: collect the data again"
             )
+        series = f"{stem}-{about['arguments']['seed']}.json"
+        if file.name != series:
+            raise InputError(f"{short_path(file)} describes another series, whose description is {series}: delete it")
         described |= _check_shards(data, stem, about)
         arguments.append(content["arguments"])
-    stray = sorted(set(data.glob(f"{stem}-*.safetensors")) - described.keys())
+    stray = sorted(set(files_in(data, f"{stem}-*.safetensors")) - described.keys())
     if stray:
         raise InputError(
             f"{short_path(stray[0])} belongs to no description in its folder: its collection did not finish, or was "
@@ -92,7 +96,7 @@ def read_description(data: Path, stem: str, *, scene: str) -> dict[str, Any]:
 
 def read_shards(folder: Path, stem: str, names: Sequence[str]) -> list[dict[str, Tensor]]:
     """Tensors of every ``stem-*.safetensors`` in ``folder``; raises `InputError` naming what is missing or broken."""
-    files = sorted(Path(folder).glob(f"{stem}-*.safetensors"))
+    files = files_in(Path(folder), f"{stem}-*.safetensors")
     if not files:
         raise InputError(f"no {stem}-*.safetensors in {short_path(Path(folder))}")
     shards = []
@@ -101,10 +105,21 @@ def read_shards(folder: Path, stem: str, names: Sequence[str]) -> list[dict[str,
         missing = [name for name in names if name not in shard]
         if missing:
             raise InputError(f"{short_path(file)} lacks {', '.join(missing)}")
+        if made.get("content", content := content_digest(shard)) != content:
+            raise InputError(f"{short_path(file)} is damaged: it holds something else than was written")
         if "length" in names and made.get("episodes", str(len(shard["length"]))) != str(len(shard["length"])):
             raise InputError(f"{short_path(file)} says {made['episodes']} episodes and has {len(shard['length'])}")
         shards.append(shard)
     return shards
+
+
+def content_digest(tensors: Mapping[str, Tensor]) -> str:
+    """A few letters that tell the contents of shards apart."""
+    told = hashlib.sha256()
+    for name, tensor in sorted(tensors.items()):
+        told.update(f"{name} {tensor.dtype} {tuple(tensor.shape)} ".encode())
+        told.update(tensor_bytes(tensor))
+    return told.hexdigest()[:16]
 
 
 def check_made(path: Path, made: dict[str, str]) -> list[str]:
@@ -113,7 +128,7 @@ def check_made(path: Path, made: dict[str, str]) -> list[str]:
     Raises:
         InputError: the shard is damaged, or was made otherwise in anything but the number of its ``episodes``.
     """
-    there = read_metadata(path, InputError)
+    there = _read_made(path)
     told = {**made, **dict.fromkeys(_DECISIVE & there.keys())}
     differing = [name for name in told if there.get(name) != made.get(name)]
     for name in differing:
@@ -128,6 +143,14 @@ _DECISIVE = {"scene", "num_envs", "episodes", "static", "weights"}
 """What decides a shard's numbers, beside its name."""
 
 
+def _read_made(path: Path) -> dict[str, str]:
+    """How the shard at ``path`` was made, by its own word; raises `InputError` where it is another one by that word."""
+    there = read_metadata(path, InputError)
+    if there.get("shard", path.stem) != path.stem:
+        raise InputError(f"{short_path(path)} is the shard {there['shard']} under another name: delete it")
+    return there
+
+
 def _check_shards(data: Path, stem: str, about: Description) -> dict[Path, dict[str, str]]:
     """Shards that a description tells of, and what they tell; raises `InputError` where one is missing or another."""
     asked = about["arguments"]
@@ -136,7 +159,7 @@ def _check_shards(data: Path, stem: str, about: Description) -> dict[Path, dict[
         path = shard_path(data, stem, asked["seed"], index)
         made = {"scene": about["scene"], "num_envs": str(asked["num_envs"]), "episodes": str(episodes)}
         made |= {"static": asked["static"]} if stem == "arrivals" else {}
-        there = read_metadata(path, InputError)
+        there = _read_made(path)
         for name, value in made.items():
             if there.get(name) != value:
                 raise InputError(

@@ -1,8 +1,18 @@
 import pytest
 import torch
 
-from torchdyn_plan.evaluation.results import NO_CAUSE
-from torchdyn_plan.tasks.trapper.causes import ETA_TOLERANCE, FORECAST_TOLERANCE, failure_cause
+from tests.tasks.trapper.test_evidence import record
+from torchdyn_plan.evaluation import evaluate
+from torchdyn_plan.evaluation.results import NO_CAUSE, EpisodeOutcomes
+from torchdyn_plan.kinematics import UR5_SPEED_LIMIT
+from torchdyn_plan.tasks.trapper.causes import (
+    ETA_TOLERANCE,
+    FORECAST_TOLERANCE,
+    JOINT_SPEED,
+    failure_cause,
+    fastest,
+    measure,
+)
 from torchdyn_plan.tasks.trapper.evidence import NEVER, Evidence
 from torchdyn_plan.tasks.trapper.task import TASK
 
@@ -98,3 +108,40 @@ def test_any_batch_shape():
     flat = failure_cause(*flags.flatten(1), Evidence(*(clue.flatten() for clue in evidence)))
     assert together.flatten().tolist() == flat.tolist()
     assert failure_cause(*flags[:, 0, 0], Evidence(*(clue[0, 0] for clue in evidence))).shape == ()
+
+
+def outcomes(success, speed):
+    count = len(success)
+    none = torch.full((count,), -1)
+    return EpisodeOutcomes(
+        success=torch.tensor(success),
+        steps=none,
+        replans=none,
+        solvable=torch.ones(count, dtype=torch.bool),
+        evidence={} if speed is None else {JOINT_SPEED: torch.tensor(speed)},
+        cause=none,
+        seconds=1.0,
+    )
+
+
+def test_a_peak_of_joint_speed_lies_within_the_episode():
+    trace = record(length=60)
+    trace.joint_speed[0, 60] = 2.0 * UR5_SPEED_LIMIT
+    trace.joint_speed[0, 61] = 9.0
+    assert fastest(trace).tolist() == [2.0]
+
+
+def test_joint_speeds_are_counted_in_successes_and_their_peak_in_all():
+    found = measure(outcomes([True, True, False, True], [1.01, 1.5, 4.0, 0.9]))
+    assert found == {"joint_speed_peak": 4.0, "joint_speed_above": pytest.approx(1 / 3)}
+    assert measure(outcomes([False], [1.5])) == {"joint_speed_peak": 1.5, "joint_speed_above": None}
+    assert measure(outcomes([True], None)) == {"joint_speed_peak": None, "joint_speed_above": None}
+
+
+def test_an_evaluation_tells_how_fast_joints_were():
+    found = evaluate("trapper", ["pursuit"], episodes=2, num_envs=2, num_threads=1, split="dev", progress=False)
+    speed = found.outcomes["pursuit"].evidence[JOINT_SPEED]
+    # A pursuing arm is driven at its limits.
+    assert ((speed > 0.5) & (speed < 9.0)).all()
+    assert found.rows[0].measures["joint_speed_peak"] == speed.max().item()
+    assert "joint speed peak" in found.table()

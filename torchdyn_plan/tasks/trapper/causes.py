@@ -7,13 +7,18 @@ from torch import Tensor
 
 from torchdyn_plan.envs.trapper.scene import TrapperScene
 from torchdyn_plan.evaluation.episodes import EpisodeLog
-from torchdyn_plan.evaluation.results import NO_CAUSE
+from torchdyn_plan.evaluation.results import NO_CAUSE, EpisodeOutcomes
+from torchdyn_plan.evaluation.traces import Trace
 from torchdyn_plan.tasks.task import Truth, Verdict
 from torchdyn_plan.tasks.trapper.evidence import Evidence, find_evidence
 from torchdyn_plan.tasks.trapper.task import CAUSES
 
 FORECAST_TOLERANCE = 0.04
 """A ball that comes no nearer than this to the promised place about the promised time is elsewhere [m]."""
+JOINT_SPEED = "joint_speed"
+"""Evidence: the greatest speed of any joint over its limit."""
+TOO_FAST = 1.02
+"""A joint is beyond its limit above this share of it: a little more is how a servo settles."""
 ETA_TOLERANCE = 5
 """An arm that comes later than promised by more than this is late: a bin of the arrival predictor [control steps]."""
 
@@ -21,12 +26,37 @@ ETA_TOLERANCE = 5
 def judge_episodes(log: EpisodeLog, truth: Truth, scene: TrapperScene) -> Verdict:
     """Why the episodes of ``log`` failed, what their records say of it, and whether the ball was ``touched``."""
     evidence = Evidence.none(len(log.done))
+    joint_speed = torch.zeros(len(log.done))
     for episodes, trace in log.records():
+        joint_speed[episodes] = fastest(trace) / scene.joint_speed
         for whole, part in zip(evidence, find_evidence(scene, trace, truth.future[episodes]), strict=True):
             whole[episodes] = part
     touched = evidence.contact_step >= 0
     cause = failure_cause(log.success, truth.solvable, touched, log.flags["pocketed"], evidence)
-    return Verdict(cause, {"touched": touched}, evidence._asdict())
+    return Verdict(cause, {"touched": touched}, evidence._asdict() | {JOINT_SPEED: joint_speed})
+
+
+def fastest(trace: Trace) -> Tensor:
+    """Greatest speed of any joint in each episode, ``(R,)`` [rad/s].
+
+    Commands keep to the limits, and so do joints that nothing pushes: what is above comes of the box's contact with
+    ball, table or rails.
+    """
+    within = torch.arange(trace.joint_speed.shape[1]) <= trace.length.unsqueeze(-1)
+    return trace.joint_speed.masked_fill(~within, 0.0).amax(-1)
+
+
+def measure(outcomes: EpisodeOutcomes) -> dict[str, float | None]:
+    """How far joints pass their speed limits: the peak of all episodes, and the share of successes that pass them.
+
+    Both are None of outcomes that do not tell of it, and the share is None where there is no success.
+    """
+    speed = outcomes.evidence.get(JOINT_SPEED)
+    if speed is None:
+        return dict.fromkeys(("joint_speed_peak", "joint_speed_above"))
+    above = (speed > TOO_FAST)[outcomes.success]
+    share = above.double().mean().item() if len(above) else None
+    return {"joint_speed_peak": speed.max().item(), "joint_speed_above": share}
 
 
 def failure_cause(trapped: Tensor, solvable: Tensor, touched: Tensor, pocketed: Tensor, evidence: Evidence) -> Tensor:

@@ -194,6 +194,13 @@ def judge(scene: Scene, settings: TrapperSettings, log: Any, truth: Truth) -> Ve
     return judge_episodes(log, truth, trapper_scene(scene))
 
 
+def measure(outcomes: Any) -> dict[str, float | None]:
+    """As `Task.measure` says: how far the joints pass their speed limits."""
+    from torchdyn_plan.tasks.trapper.causes import measure
+
+    return measure(outcomes)
+
+
 def record_paths(scene: Scene, blocks: Any, **how: Any) -> dict[str, Any]:
     """As `Task.record_paths` says: balls rolled alone."""
     from torchdyn_plan.tasks.trapper.data import record_rolls
@@ -270,6 +277,7 @@ def trapper_task(scene: Scene) -> Task:
         truth=partial(truth, scene),
         causes=CAUSES,
         judge=partial(judge, scene),
+        measure=measure,
         record_paths=partial(record_paths, scene),
         record_arrivals=partial(record_arrivals, scene),
         fitting=partial(fitting, scene),
