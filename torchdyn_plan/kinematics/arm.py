@@ -15,7 +15,7 @@ from torchdyn_plan.errors import InputError
 from torchdyn_plan.kinematics.components import ComponentForm
 from torchdyn_plan.kinematics.coupling import CoupledComponents, CoupledForm, drivers_of, full_turns
 from torchdyn_plan.kinematics.descriptions import Source, joints_of_chain
-from torchdyn_plan.kinematics.forms import FORMS, SineForm, TransformForm
+from torchdyn_plan.kinematics.forms import FORMS
 from torchdyn_plan.kinematics.joint import Joint, check_limits, merge_fixed
 from torchdyn_plan.kinematics.mjcf import joints_of_mjcf
 from torchdyn_plan.kinematics.ur5 import UR5_SPEED_LIMIT, ur5_urdf
