@@ -12,6 +12,7 @@ longer; ``extra`` is how much longer it takes on average, ``worst`` at most [s].
 from __future__ import annotations
 
 import time
+from collections.abc import Callable
 from dataclasses import dataclass
 from statistics import median
 from typing import Any
@@ -103,20 +104,21 @@ def measured(line: str, poses: int) -> Row:
 
 
 def speed(poses: int, seconds: float) -> Row:
-    """Time a pose [µs] of all solutions at once, and whether they are EAIK's."""
+    """Time a pose [µs] of all solutions at once, the median and the least, and whether they are EAIK's."""
     from torchdyn_plan.kinematics import branches
 
-    row: Row = {}
     arm, eaik = Arm.ur5(dtype=torch.float64), Eaik()
-    target = arm(positions(arm, poses, 1))
-    for _ in range(2):
-        for dtype in (torch.float32, torch.float64):
-            single, poses_of = Arm.ur5(dtype=dtype), target.to(dtype)
-            times = sample(lambda single=single, poses_of=poses_of: branches(single, poses_of), seconds=seconds)
-            row[f"branches, {str(dtype).removeprefix('torch.')}"] = 1e6 * median(times) / poses
-        rows = target.numpy()
-        times = sample(lambda rows=rows: [eaik.robot.IK(one) for one in rows], seconds=seconds)
-        row["EAIK"] = 1e6 * median(times) / poses
+    target, single = arm(positions(arm, poses, 1)), Arm.ur5()
+    rows, narrow = target.numpy(), target.float()
+    ways: dict[str, Callable[[], object]] = {
+        "branches, float32": lambda: branches(single, narrow),
+        "branches, float64": lambda: branches(arm, target),
+        "EAIK": lambda: [eaik.robot.IK(one) for one in rows],
+    }
+    row: Row = {}
+    for name, solve in ways.items():
+        times = sample(solve, seconds=seconds)
+        row |= {name: 1e6 * median(times) / poses, f"{name}, least": 1e6 * min(times) / poses}
     found = branches(arm, target)
     theirs = [exact(eaik, pose) for pose in target]
     row["of_theirs_found"] = float(
