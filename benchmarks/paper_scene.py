@@ -42,9 +42,6 @@ OPEN: Mapping[str, tuple[float, ...]] = {
     "arm_speed": (1.5, 2.0, 3.0),
     "acceleration_limit": (150.0,),
     "control_step": (0.002,),
-    "table_side": (1.4,),
-    "base_setback": (0.0,),
-    "box_half_width": (0.075,),
 }
 """What the paper leaves open, and other values of it than the shipped scene's."""
 OF_THE_BALL = frozenset(("control_step", "table_side"))
