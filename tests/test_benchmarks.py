@@ -3,12 +3,11 @@
 import importlib
 import importlib.util
 import json
-import subprocess
-import sys
 from pathlib import Path
 
 import pytest
 
+from tests.scripts import run
 from torchdyn_plan.tasks import load_task
 
 BENCHMARKS = Path(__file__).parent.parent / "benchmarks"
@@ -54,16 +53,9 @@ def test_benchmark_runs(name, tmp_path):
     if name.startswith("reach") and importlib.util.find_spec("gymnasium_robotics") is None:
         pytest.skip("gymnasium-robotics has the arm")
     out = tmp_path / "figures.json"
-    run = subprocess.run(
-        [sys.executable, BENCHMARKS / f"{name}.py", *SMALL[name].split(), "--out", out],
-        cwd=BENCHMARKS.parent,
-        env={"PYTHONPATH": str(BENCHMARKS.parent), "OMP_NUM_THREADS": "1", "PATH": ""},
-        capture_output=True,
-        text=True,
-        check=False,
-        timeout=300,
-    )
-    assert run.returncode == 0, run.stderr
+    words = [*SMALL[name].split(), "--out", out]
+    ran = run(BENCHMARKS / f"{name}.py", *words, cwd=BENCHMARKS.parent, OMP_NUM_THREADS="1", PATH="")
+    assert ran.returncode == 0, ran.stderr
     figures = json.loads(out.read_text())
     assert figures.keys() >= {"machine", "versions"}
     assert len(figures["rows"]) > 0

@@ -2,12 +2,11 @@
 
 import re
 import shlex
-import subprocess
-import sys
 from pathlib import Path
 
 import pytest
 
+from tests.scripts import run
 from torchdyn_plan.cli import commands, main
 
 ROOT = Path(__file__).parent.parent
@@ -32,14 +31,12 @@ def same(expected, printed):
 
 @pytest.mark.parametrize(("code", "printed"), list(blocks("python")))
 def test_code_runs_and_prints_what_the_page_says(code, printed, tmp_path):
-    run = subprocess.run(
-        [sys.executable, "-c", code], cwd=tmp_path, capture_output=True, text=True, check=False, timeout=300
-    )
-    assert run.returncode == 0, run.stderr
+    ran = run(code, cwd=tmp_path)
+    assert ran.returncode == 0, ran.stderr
     comment = re.search(r"^print\(.*#  *(.*)$", code, re.MULTILINE)
     expected = printed or (comment and comment[1])
     if expected:
-        same(expected, run.stdout)
+        same(expected, ran.stdout)
 
 
 def command_lines():

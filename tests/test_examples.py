@@ -7,6 +7,7 @@ import pytest
 from matplotlib.image import imread
 
 from tests.menagerie import write as write_menagerie
+from tests.scripts import run
 
 EXAMPLES = Path(__file__).parent.parent / "examples"
 
@@ -30,16 +31,9 @@ EXAMPLES = Path(__file__).parent.parent / "examples"
 )
 def test_example_runs(name, says, tmp_path):
     file, *words = name.split()
-    run = subprocess.run(
-        [sys.executable, EXAMPLES / file, *words],
-        cwd=tmp_path,
-        capture_output=True,
-        text=True,
-        check=False,
-        timeout=300,
-    )
-    assert run.returncode == 0, run.stderr
-    assert says in run.stdout
+    ran = run(EXAMPLES / file, *words, cwd=tmp_path)
+    assert ran.returncode == 0, ran.stderr
+    assert says in ran.stdout
 
 
 DRAWS = """
@@ -54,6 +48,7 @@ the library then; where there is none that needs no screen, with a `mujoco.Fatal
 
 
 def run_with_graphics(backend, folder, *words):
+    """In a process that imports MuJoCo itself, as it chooses its graphics then."""
     environment = {**os.environ, "MUJOCO_GL": backend}
     command = [sys.executable, *words]
     return subprocess.run(
@@ -68,8 +63,8 @@ def test_the_picture_of_a_trap_is_drawn(tmp_path):
         reasons = [f"{backend}: {probe.stderr.strip().splitlines()[-1]}" for backend, probe in probes.items()]
         pytest.skip(f"MuJoCo cannot draw here without a screen ({'; '.join(reasons)})")
     file = tmp_path / "trap.png"
-    run = run_with_graphics(drawing[0], tmp_path, EXAMPLES / "03_picture_of_a_trap.py", file)
-    assert run.returncode == 0, run.stderr
+    ran = run_with_graphics(drawing[0], tmp_path, EXAMPLES / "03_picture_of_a_trap.py", file)
+    assert ran.returncode == 0, ran.stderr
     picture = imread(file)[..., :3]
     assert picture.shape == (720, 1280, 3)
     # The goal's red, the forecast's blue and the path's yellow are all there to be seen.

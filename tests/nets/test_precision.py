@@ -130,13 +130,29 @@ def test_vmap_over_one_of_two_arguments(name, mapped):
     assert_close(found, kind.call(network, tuple(seen)))
 
 
+ASKED_BY_PLANNERS = ("spread for inference", "arrival from a state for inference")
+"""Forms that planners ask, which have judged what they read already: they look for no NaN again."""
+
+
 def test_a_nan_is_told_under_vmap_too(kind, network):
     if kind.make.__name__ == "critic":
         pytest.skip("a critic is asked by training alone, and checks nothing")
+    if kind in [KINDS[name] for name in ASKED_BY_PLANNERS]:
+        pytest.skip("asked by planners, which have looked for it")
     seen = tuple(value.clone() for value in kind.inputs(3))
     seen[0][1] = torch.nan
     with pytest.raises(InputError, match="must be finite"):
         torch.vmap(lambda *row: kind.call(network, row))(*seen)
+
+
+@pytest.mark.parametrize("name", ASKED_BY_PLANNERS)
+def test_a_nan_in_what_a_planner_has_not_judged_stays_in_its_row(name):
+    network, seen = KINDS[name].make().requires_grad_(False), tuple(value.clone() for value in KINDS[name].inputs(3))
+    expected = KINDS[name].call(network, seen)
+    seen[0][1] = torch.nan
+    for found, usual in zip(KINDS[name].call(network, seen), expected, strict=True):
+        assert found[1].isnan().all()
+        assert_close((found[::2],), (usual[::2],))
 
 
 def test_derivatives_under_transforms(kind, network):

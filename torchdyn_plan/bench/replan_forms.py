@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 import hashlib
 import json
 from collections.abc import Callable, Mapping, Sequence
@@ -42,8 +43,7 @@ def make_forms(
 ) -> list[Form]:
     """Everything that is timed on ``device``."""
     dynamic = {name: planner for name, planner in planners.items() if isinstance(planner, DynamicPlanner)}
-    # A planner that was just made is in training mode, and prepares no copies.
-    plain = _planning(dynamic, {name: type(planner)(**planner.part_settings()) for name, planner in dynamic.items()})
+    plain = _planning(dynamic, {name: _by_models(planner) for name, planner in dynamic.items()})
     light = _planning_for_inference(dynamic)
     alone: dict[str, Parts] = {}
     for name, planner in planners.items():
@@ -67,6 +67,13 @@ def make_forms(
     if compiled:
         add(light, INFERENCE, partial(torch.compile, fullgraph=True, **COMPILED[torch.device(device).type]))
     return forms
+
+
+def _by_models(planner: DynamicPlanner) -> DynamicPlanner:
+    """The same planner, that plans by its models themselves."""
+    made = copy.copy(planner)
+    made.prepared = None
+    return made
 
 
 def _planning(planners: Mapping[str, DynamicPlanner], forms: Mapping[str, DynamicPlanner]) -> dict[str, Parts]:
