@@ -12,6 +12,9 @@ TARGET_POS = "target_pos"
 TARGET_HISTORY = "target_history"
 HISTORY_LENGTH = "history_length"
 TARGET_FUTURE = "target_future"
+MEASURED_POS = "measured_pos"
+MEASURED_TIME = "measured_time"
+TRUE_TARGET_POS = "true_target_pos"
 ROBOT_STATE = "robot_state"
 OBSERVATION = "observation"
 ACHIEVED_GOAL = "achieved_goal"
@@ -30,7 +33,8 @@ class Key:
 
     name: str
     shape: tuple[str | int, ...]
-    """Trailing shape after the batch: N joints, A action size, H history, F horizon, S robot state size."""
+    """Trailing shape after the batch: N joints, A action size, H history, F horizon, S robot state size, M measurements
+    that can come at a step."""
     meaning: str
     writer: str
 
@@ -51,6 +55,14 @@ KEYS: tuple[Key, ...] = (
     Key(name=GOAL, shape=(3,), meaning="place the static planner is sent to [m, world]", writer="planner"),
     Key(name=ARRIVAL_STEPS, shape=(), meaning="control steps from now to the meeting", writer="planner"),
     Key(name=ACTION, shape=("A",), meaning="what the robot is told to do, each entry -1 to 1", writer="static planner"),
+    Key(
+        name=MEASURED_POS,
+        shape=("M", 3),
+        meaning="measurements that come now [m, world]",
+        writer="sensor",
+    ),
+    Key(name=MEASURED_TIME, shape=("M",), meaning="when they were taken [s since the reset]", writer="sensor"),
+    Key(name=TRUE_TARGET_POS, shape=(3,), meaning="the target itself, for those who judge [m, world]", writer="sensor"),
     Key(name=TARGET_FUTURE, shape=("F", 3), meaning="recorded truth, for the oracle [m, world]", writer="evaluation"),
     Key(name=PLAN, shape=(), meaning="the planner's memory between steps (nested)", writer="planner"),
 )

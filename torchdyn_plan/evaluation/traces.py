@@ -54,7 +54,7 @@ class TraceLog:
         else:
             goal, *numbers = map(plan.get, ("goal", "arrival_steps", "replanned", "reachable"))
             numbers = torch.stack(numbers, dim=-1)
-        entries = torch.cat([tool_pos, stepped[keys.TARGET_POS], goal, numbers], dim=-1)
+        entries = torch.cat([tool_pos, true_target(stepped), goal, numbers], dim=-1)
         self._record[self._rows, step] = entries.to(self._record.dtype)
 
     def end(self, stepped: TensorDictBase, rows: Tensor) -> None:
@@ -62,7 +62,7 @@ class TraceLog:
         after: TensorDictBase = stepped.get("next")
         length = after[keys.STEP_COUNT].squeeze(-1)[rows]
         record = self._record[rows]
-        last = torch.cat([after[keys.TOOL_POS][rows], after[keys.TARGET_POS][rows]], dim=-1)
+        last = torch.cat([after[keys.TOOL_POS][rows], true_target(after)[rows]], dim=-1)
         record[torch.arange(len(rows)), length, :6] = last.to(record.dtype)
         self._ended.append(record)
         self._lengths.append(length)
@@ -75,6 +75,12 @@ class TraceLog:
         return [
             _split(record, length) for record, length in zip(records.split(block), lengths.split(block), strict=True)
         ]
+
+
+def true_target(tensordict: TensorDictBase) -> Tensor:
+    """Where targets are, ``(*B, 3)`` [m, world], whatever a sensor makes of it."""
+    truth = tensordict.get(keys.TRUE_TARGET_POS, None)
+    return tensordict[keys.TARGET_POS] if truth is None else truth
 
 
 def _split(record: Tensor, length: Tensor) -> Trace:
