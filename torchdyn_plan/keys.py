@@ -15,6 +15,7 @@ TARGET_FUTURE = "target_future"
 MEASURED_POS = "measured_pos"
 MEASURED_TIME = "measured_time"
 TRUE_TARGET_POS = "true_target_pos"
+TARGET_COVARIANCE = "target_covariance"
 ROBOT_STATE = "robot_state"
 OBSERVATION = "observation"
 ACHIEVED_GOAL = "achieved_goal"
@@ -63,6 +64,7 @@ KEYS: tuple[Key, ...] = (
     ),
     Key(name=MEASURED_TIME, shape=("M",), meaning="when they were taken [s since the reset]", writer="sensor"),
     Key(name=TRUE_TARGET_POS, shape=(3,), meaning="the target itself, for those who judge [m, world]", writer="sensor"),
+    Key(name=TARGET_COVARIANCE, shape=(2, 2), meaning="of position and velocity [m², m²/s, m²/s²]", writer="track"),
     Key(name=TARGET_FUTURE, shape=("F", 3), meaning="recorded truth, for the oracle [m, world]", writer="evaluation"),
     Key(name=PLAN, shape=(), meaning="the planner's memory between steps (nested)", writer="planner"),
 )

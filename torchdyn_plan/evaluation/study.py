@@ -14,7 +14,7 @@ from torchdyn_plan.envs.sensor import Sensor
 from torchdyn_plan.errors import InputError
 from torchdyn_plan.evaluation.episodes import Planner, find_truth, run_episodes
 from torchdyn_plan.evaluation.results import EpisodeOutcomes, ResultRow, summarize
-from torchdyn_plan.planners import Delivery, DynamicPlanner
+from torchdyn_plan.planners import Delivery, DynamicPlanner, TrackedPlanner
 from torchdyn_plan.planners.pretrained import planner_digest
 from torchdyn_plan.tasks.task import Settings, Task
 from torchdyn_plan.threads import one_thread
@@ -144,4 +144,6 @@ def _check_scenes(task: Task, planners: Mapping[str, Planner]) -> None:
 
 def _delivered(planner: Planner, delivery: Delivery) -> Planner:
     """The same planner whose plans come by ``delivery``; one that makes no plans as it is."""
+    if isinstance(planner, TrackedPlanner):
+        return planner.with_planner(_delivered(planner.planner, delivery))
     return planner.with_parts(delivery=delivery) if isinstance(planner, DynamicPlanner) else planner
