@@ -21,7 +21,7 @@ from torchdyn_plan.checks import check_number, check_trailing_shape, hides_value
 from torchdyn_plan.planners.rows import where_rows
 
 LARGEST = 1e6
-"""No place that is measured is farther from the origin [m]."""
+"""No place that is measured is farther from the origin [m], and no moment from the reset [s]."""
 CLOCKS = 1e-4
 """A measurement may come this much from the future: clocks round [s]."""
 
@@ -71,7 +71,9 @@ class TrackState(NamedTuple):
         """
         time = torch.maximum(time, self.begin.unsqueeze(-1))
         since, n = self.since.unsqueeze(-1), _order(self.motion.shape[-1])
-        now = _polynomial(self.motion[..., : 3 * n], time - self.time.unsqueeze(-1))
+        # Of rows of which nothing is known the time is infinite.
+        passed = time - self.time.clamp_min(-LARGEST).unsqueeze(-1)
+        now = _polynomial(self.motion[..., : 3 * n], passed)
         earlier = time < since
         if not (hides_values(earlier) or debug_unwrap(earlier).any()):
             return now
@@ -179,7 +181,7 @@ class Track(ABC):
         Raises:
             InputError: a shape is wrong.
         """
-        if pos.shape[:-1] != time.shape or time.shape != state.time.shape:
+        if pos.shape != (*time.shape, 3) or time.shape != state.time.shape:
             check_trailing_shape("time of a measurement", time, *state.time.shape)
             check_trailing_shape("pos of a measurement", pos, *state.time.shape, 3)
         spread = self.noise**2 if variance is None else variance

@@ -40,7 +40,12 @@ class TrackedPlanner(PretrainedPlanner, Remembering):
     """
 
     def __init__(
-        self, planner: Callable[[TensorDictBase], TensorDictBase], track: Track, *, control_step: float, history: int = 24
+        self,
+        planner: Callable[[TensorDictBase], TensorDictBase],
+        track: Track,
+        *,
+        control_step: float,
+        history: int = 24,
     ) -> None:
         """Let ``planner`` see by ``track``.
 
@@ -129,7 +134,9 @@ class TrackedPlanner(PretrainedPlanner, Remembering):
     def _shown(self, state: TrackState, present: TrackState, usable: Tensor, now: Tensor) -> tuple[Tensor, ...]:
         """What the planner sees, as in `SHOWN`; no numbers in rows without a usable track."""
         ago = self.control_step * torch.arange(1 - self.history, 1, dtype=now.dtype, device=now.device)
-        history = where_rows(usable, state.path(now.unsqueeze(-1) + ago), torch.full_like(now, torch.nan)[..., None, None])
+        history = where_rows(
+            usable, state.path(now.unsqueeze(-1) + ago), torch.full_like(now, torch.nan)[..., None, None]
+        )
         covariance = where_rows(usable, present.covariance, torch.zeros_like(now)[..., None, None])
         return history[..., -1, :], history, covariance
 
