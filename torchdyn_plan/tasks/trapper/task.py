@@ -140,6 +140,20 @@ def exact(parts: PlannerParts) -> Any:
 
 def wait_and_drop(parts: PlannerParts) -> Any:
     """Waits above the most promising meeting, and drops in time: the best that there is."""
+    return waits_and_drops(parts, parts.spread_forecaster, parts.eta)
+
+
+def untrained(parts: PlannerParts) -> Any:
+    """The same without any training: with the mechanics of the ball, and the limits of the arm's joints."""
+    from torchdyn_plan.envs.trapper.scene import TrapperScene
+    from torchdyn_plan.tasks.trapper.untrained import arm_arrival, billiard
+
+    scene = TrapperScene()
+    return waits_and_drops(parts, billiard(scene), arm_arrival(scene, ik_planner(scene)))
+
+
+def waits_and_drops(parts: PlannerParts, forecaster: Any, eta: Any) -> Any:
+    """A planner that waits and drops, by this forecaster and this model of arrivals."""
     from torchdyn_plan.envs.trapper.scene import TrapperScene
     from torchdyn_plan.planners import DynamicPlanner, ReplanSchedule
     from torchdyn_plan.tasks.trapper.wait_and_drop import WaitAndDrop, waiting_search
@@ -147,7 +161,7 @@ def wait_and_drop(parts: PlannerParts) -> Any:
     scene = TrapperScene()
     # Candidates are 5 steps apart: a plan every 5 steps keeps them on the same places, and so the waiting tool still.
     own = {"search": waiting_search(scene), "schedule": ReplanSchedule.every(5), "maneuver": WaitAndDrop.of(scene)}
-    return DynamicPlanner(parts.static, parts.spread_forecaster, parts.eta, **own, **common(parts)).eval()
+    return DynamicPlanner(parts.static, forecaster, eta, **own, **common(parts)).eval()
 
 
 def truth(settings: TrapperSettings, **episodes: Any) -> Truth:
@@ -223,7 +237,9 @@ TASK = Task(
         "oracle": oracle,
         "exact": exact,
         "wait_and_drop": wait_and_drop,
+        "untrained": untrained,
     },
+    rivals=("untrained",),
     truth=truth,
     causes=("unreachable", "planner_too_slow", "forecast", "eta", "early_contact", "pocketed", "late"),
     judge=judge,
