@@ -8,13 +8,12 @@ Ruckig is a library of its own, ``pip install ruckig``; without it only our time
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any
 
 import torch
 import tyro
+from study import Output, Row, Study
 from torch import Tensor
 
-from study import Output, Row, Study
 from torchdyn_plan.bench.timing import figures, sample
 from torchdyn_plan.kinematics import UR5_SPEED_LIMIT
 from torchdyn_plan.kinematics.timing import arrival_time
@@ -68,7 +67,12 @@ def compare(cases: int) -> Row:
     given = draw(cases)
     ours, theirs = arrival_time(*given), ruckig_time(*given)
     error = (ours / theirs - 1.0).abs()
-    return {"what": "difference", "cases": cases, "largest_share": error.max().item(), "mean_share": error.mean().item()}
+    return {
+        "what": "difference",
+        "cases": cases,
+        "largest_share": error.max().item(),
+        "mean_share": error.mean().item(),
+    }
 
 
 def measure(batch: int, seconds: float) -> Row:

@@ -49,8 +49,10 @@ def test_a_target_goes_on():
 
 def test_a_target_falls():
     time = STEP * torch.arange(-23, 61, dtype=torch.float64).unsqueeze(-1)
-    flight = torch.tensor([0.1, 0.2, 1.5]) + time * torch.tensor([2.0, -1.0, 3.0]) - 0.5 * 9.81 * time**2 * (
-        torch.tensor([0.0, 0.0, 1.0])
+    flight = (
+        torch.tensor([0.1, 0.2, 1.5])
+        + time * torch.tensor([2.0, -1.0, 3.0])
+        - 0.5 * 9.81 * time**2 * (torch.tensor([0.0, 0.0, 1.0]))
     )
     path = Ballistic(horizon=60).predict(flight[:24]).path
     torch.testing.assert_close(path, flight[24:])

@@ -19,11 +19,10 @@ BAD = float("nan")
 def measured(track, times, places, *, now=None, state=None, variance=None):
     """The state after measurements ``places`` (*B, T, 3) at ``times`` (T,), one after the other."""
     state = track.start(places[..., 0, :]) if state is None else state
-    for index, time in enumerate(times.tolist()):
-        time = places.new_full(places.shape[:-2], time)
-        state = track.add(
-            state, time, places[..., index, :], time if now is None else time * 0.0 + now, variance=variance
-        )
+    for index, moment in enumerate(times.tolist()):
+        time = places.new_full(places.shape[:-2], moment)
+        present = time if now is None else torch.full_like(time, now)
+        state = track.add(state, time, places[..., index, :], present, variance=variance)
     return state
 
 

@@ -234,7 +234,15 @@ class Billiard(AnalyticForecast):
 
     def part_settings(self) -> dict[str, Any]:
         """Arguments that make the same model."""
-        names = ("half_extent", "restitution", "restitution_deviation", "deceleration", "sliding", "gaps", "gone_height")
+        names = (
+            "half_extent",
+            "restitution",
+            "restitution_deviation",
+            "deceleration",
+            "sliding",
+            "gaps",
+            "gone_height",
+        )
         return super().part_settings() | {name: getattr(self, name) for name in names}
 
     def _slowed(self, history: Tensor, velocity: Tensor, time: Tensor) -> Tensor:

@@ -7,7 +7,7 @@ remembers is a `TrackState` of tensors, which whoever uses it stores from step t
 from __future__ import annotations
 
 import math
-from abc import ABC
+from abc import ABC, abstractmethod
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
@@ -80,6 +80,17 @@ class TrackState(NamedTuple):
         return torch.where(earlier.unsqueeze(-1), _polynomial(self.before, time - since), now)
 
 
+class Measurement(NamedTuple):
+    """A measurement in each row."""
+
+    time: Tensor
+    """``(*B,)`` when it was taken; NaN for none [s]."""
+    pos: Tensor
+    """``(*B, 3)`` [m, world]."""
+    variance: Tensor | float
+    """``(*B,)`` of its error along each axis [m²]."""
+
+
 class Prediction(NamedTuple):
     """What is expected of a measurement in each row. Components come first: ``(3, *B)``, and ``(1, *B)`` for one."""
 
@@ -115,7 +126,7 @@ class Track(ABC):
     """No target moves faster [m/s]."""
     gate: float = 5.0
     """A measurement fits up to so many standard deviations of what is expected of it."""
-    rebound: float = 0.7
+    rebound: float = 0.9
     """Share of the speed that is taken to come back from a bounce, along the axes in which it shows."""
     patience: float = 0.2
     """So long a track is of use without a measurement [s]."""
@@ -142,9 +153,9 @@ class Track(ABC):
         return 0.0
 
     @property
+    @abstractmethod
     def wander(self) -> float:
         """Spectral density of what changes the last of the n derivatives."""
-        return 0.0
 
     @cached_property
     def _drift(self) -> tuple[tuple[int, int, int, float], ...]:
@@ -184,8 +195,8 @@ class Track(ABC):
         if pos.shape != (*time.shape, 3) or time.shape != state.time.shape:
             check_trailing_shape("time of a measurement", time, *state.time.shape)
             check_trailing_shape("pos of a measurement", pos, *state.time.shape, 3)
-        spread = self.noise**2 if variance is None else variance
-        expected = self._expect(state, time, pos, spread)
+        measured = Measurement(time, pos, self.noise**2 if variance is None else variance)
+        expected = self._expect(state, measured)
         # A comparison with what is no number, or with a row of which nothing is known, is false.
         fits = (self._fit(expected).all(0) & (expected.passed[0] >= -self.oldest)) & (time <= now + CLOCKS)
         if not hides_values(fits):
@@ -193,30 +204,30 @@ class Track(ABC):
                 return self._used(state, expected, time)
             if debug_unwrap(time).isnan().all():
                 return state
-        return self._sorted(state, time, pos, now, spread, fits)
+        return self._sorted(state, measured, now, fits)
 
     def at(self, state: TrackState, now: Tensor) -> TrackState:
         """The state brought forward to ``now`` (*B,) [s], without a measurement: where the target is by now."""
         now = torch.maximum(now, state.time)
         known = state._replace(time=torch.where(state.count > 0, state.time, now))
-        expected = self._expect(known, now, state.pos, 0.0)
+        expected = self._expect(known, Measurement(now, state.pos, 0.0))
         return known._replace(motion=_packed(expected.mean, expected.covariance), time=now)
 
     def usable(self, state: TrackState, now: Tensor) -> Tensor:
         """Whether there is a track to go by ``now`` (*B,) [s]: ``(*B,)`` bool."""
         return (state.count >= self.least) & (now - state.time <= self.patience)
 
-    def _expect(self, state: TrackState, time: Tensor, pos: Tensor, variance: Tensor | float) -> Prediction:
-        """What is expected at ``time`` (*B,) [s], beside what was measured: ``pos`` (*B, 3) with ``variance`` [m²]."""
+    def _expect(self, state: TrackState, measured: Measurement) -> Prediction:
+        """What is expected in place of what was measured."""
         mean, covariance = _unpacked(state.motion, self.order)
-        passed = (time - state.time).unsqueeze(0)
+        passed = (measured.time - state.time).unsqueeze(0)
         ahead = passed.clamp_min(0.0)
         covariance = self._spread(covariance, ahead)
         behind = passed - ahead
         late = _factors(behind, self.order)
         lever = [_sum(row, late) for row in _whole(covariance)]
-        innovation = pos.movedim(-1, 0) - _sum(mean, _factors(passed, self.order))
-        scale = _sum(lever, late) + variance
+        innovation = measured.pos.movedim(-1, 0) - _sum(mean, _factors(passed, self.order))
+        scale = _sum(lever, late) + measured.variance
         if self._drift:
             # What may have happened since a late measurement was taken makes it less sure.
             _, _, power, factor = self._drift[0]
@@ -255,24 +266,22 @@ class Track(ABC):
             motion=_packed(mean, covariance), time=torch.maximum(state.time, time), count=state.count + 1
         )
 
-    def _sorted(
-        self, state: TrackState, time: Tensor, pos: Tensor, now: Tensor, variance: Tensor | float, fits: Tensor
-    ) -> TrackState:
+    def _sorted(self, state: TrackState, measured: Measurement, now: Tensor, fits: Tensor) -> TrackState:
         """`add` where rows differ: in some the motion begins, in some there is no measurement, or a useless one."""
+        time, pos, _ = measured
         given, known = ~time.isnan(), state.count > 0
         usable = (pos.abs().amax(-1) <= LARGEST) & (time <= now + CLOCKS) & (time.abs() <= LARGEST)
         usable = usable & ~(time < state.time - self.oldest)
         # What is no number must not reach what is computed of rows that do not use it: gradients would see it.
         last = torch.where(known, state.time, 0.0)
-        time, pos = torch.where(usable, time, last), where_rows(usable, pos, state.pos)
+        measured = measured._replace(time=torch.where(usable, time, last), pos=where_rows(usable, pos, state.pos))
         state = state._replace(time=last)
-        expected = self._expect(state, time, pos, variance)
-        passed = time - last
+        expected, passed = self._expect(state, measured), measured.time - last
         lost = ~known | (passed > self.patience)
         reach = self.max_speed * passed + self.gate * expected.variance[0].sqrt()
         flies = expected.innovation.abs().amax(0) > reach
         begins = usable & ~fits & (lost | (~flies & (passed >= 0.0)))
-        begun, used = self._begun(state, expected, time, pos, variance, lost), self._used(state, expected, time)
+        begun, used = self._begun(state, expected, measured, lost), self._used(state, expected, measured.time)
         kept = (where_rows(fits, new, old) for new, old in zip(used, state, strict=True))
         found = TrackState(*(where_rows(begins, new, old) for new, old in zip(begun, kept, strict=True)))
         return found._replace(
@@ -280,19 +289,12 @@ class Track(ABC):
             rejected=state.rejected + (given & ~fits & ~begins),
         )
 
-    def _begun(
-        self,
-        state: TrackState,
-        expected: Prediction,
-        time: Tensor,
-        pos: Tensor,
-        variance: Tensor | float,
-        lost: Tensor,
-    ) -> TrackState:
+    def _begun(self, state: TrackState, expected: Prediction, measured: Measurement, lost: Tensor) -> TrackState:
         """The state where a motion begins with a measurement, after a bounce or, in rows ``lost`` (*B,), from nothing.
 
         What bounced has turned round along the axes in which the measurement does not fit.
         """
+        time, pos, variance = measured
         where, velocity = pos.movedim(-1, 0), expected.mean[1]
         turned = velocity * torch.where(self._fit(expected), 1.0, -self.rebound)
         turned = torch.where(lost, 0.0, turned)
@@ -368,9 +370,14 @@ class LeastSquaresTrack(Track):
         """As of `Track`."""
         return 1.0 / self.window
 
+    @property
+    def wander(self) -> float:
+        """As of `Track`."""
+        return 0.0
+
 
 def _order(size: int) -> int:
-    """n of a motion of 3n + n(n+1)/2 numbers."""
+    """N of a motion of 3n + n(n+1)/2 numbers."""
     return 2 if size == 9 else 3
 
 
