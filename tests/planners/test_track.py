@@ -104,7 +104,7 @@ def test_the_order_in_which_measurements_come_does_not_matter(track):
     times, places, _, _ = line(5, noise=0.005)
     order = torch.cat([torch.tensor([0]), 1 + torch.randperm(19, generator=torch.Generator().manual_seed(2))])
     one, other = measured(track, times, places), measured(track, times[order], places[:, order], now=1.0)
-    assert (other.count == 20).all()
+    assert (other.used == 20).all()
     torch.testing.assert_close(one.motion, other.motion, rtol=1e-6, atol=1e-9)
     torch.testing.assert_close(one.time, other.time)
 
@@ -115,7 +115,7 @@ def test_a_late_measurement_makes_it_surer_and_changes_no_clock(track):
     without = measured(track, times[torch.arange(20) != 18], places[torch.arange(20) != 18])
     late = measured(track, times[18:19], places[18:19], now=1.0, state=without)
     assert late.time == without.time
-    assert late.count == without.count + 1
+    assert late.used == without.used + 1
     assert late.covariance[0, 0] < without.covariance[0, 0]
     whole = measured(track, times, places)
     assert (late.motion - whole.motion)[:6].abs().max() < 0.6 * (without.motion - whole.motion)[:6].abs().max()
@@ -188,7 +188,7 @@ def test_without_measurements_it_is_of_no_use_and_then_begins_anew(track):
     elsewhere = start + 5.0
     state = track.add(state, now + 0.5, elsewhere, now + 0.5)
     assert not track.usable(state, now + 0.5).any()
-    assert state.count.tolist() == [1, 1]
+    assert state.used.tolist() == [1, 1]
     state = track.add(state, now + 0.52, elsewhere + 0.02 * velocity, now + 0.52)
     assert track.usable(state, now + 0.52).all()
     torch.testing.assert_close(state.velocity, velocity, rtol=0.1, atol=0.05)
@@ -199,7 +199,7 @@ def test_nothing_is_known_before_the_first_measurement(track):
     state = track.start(torch.zeros(2, 3))
     now = torch.zeros(2)
     assert not track.usable(state, now).any()
-    assert track.add(state, now * torch.nan, torch.full((2, 3), torch.nan), now).count.sum() == 0
+    assert track.add(state, now * torch.nan, torch.full((2, 3), torch.nan), now).used.sum() == 0
     for entry in track.at(state, now):
         assert entry.isfinite().all()
     assert state.path(now.unsqueeze(-1)).isnan().logical_not().all()

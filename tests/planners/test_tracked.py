@@ -127,7 +127,7 @@ def test_episodes_begin_afresh_and_memory_of_no_use_is_forgotten():
     td = planner(observation((3,)))
     td[keys.STEP_COUNT] = torch.tensor([0, 1, 1])
     td[keys.PLAN, "track_motion"][2] = BAD
-    count = planner(td)["plan", "track_count"]
+    count = planner(td)["plan", "track_used"]
     assert count.tolist() == [1, 2, 1]
 
 
@@ -136,7 +136,7 @@ def test_a_long_run_through_resets_is_one_run_for_each_episode():
     seen = play(tracked(), env, 90)
     fresh = seen[keys.STEP_COUNT] == 0
     assert fresh.sum() > 6
-    assert (seen["plan", "track_count"][fresh] == 1).all()
+    assert (seen["plan", "track_used"][fresh] == 1).all()
     assert (seen["plan", "track_restarts"] <= 1).all()
 
 

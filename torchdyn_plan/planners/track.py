@@ -40,7 +40,7 @@ class TrackState(NamedTuple):
     """``(*B,)`` moment from which on the target moves as it does: the first measurement, or that after a bounce [s]."""
     before: Tensor
     """``(*B, 6)`` position and velocity at ``since`` by the motion before the bounce [m, m/s]."""
-    count: Tensor
+    used: Tensor
     """``(*B,)`` int64 measurements that were used."""
     restarts: Tensor
     """``(*B,)`` int64 of these that did not fit the motion before, and began another: bounces, mostly."""
@@ -209,13 +209,13 @@ class Track(ABC):
     def at(self, state: TrackState, now: Tensor) -> TrackState:
         """The state brought forward to ``now`` (*B,) [s], without a measurement: where the target is by now."""
         now = torch.maximum(now, state.time)
-        known = state._replace(time=torch.where(state.count > 0, state.time, now))
+        known = state._replace(time=torch.where(state.used > 0, state.time, now))
         expected = self._expect(known, Measurement(now, state.pos, 0.0))
         return known._replace(motion=_packed(expected.mean, expected.covariance), time=now)
 
     def usable(self, state: TrackState, now: Tensor) -> Tensor:
         """Whether there is a track to go by ``now`` (*B,) [s]: ``(*B,)`` bool."""
-        return (state.count >= self.least) & (now - state.time <= self.patience)
+        return (state.used >= self.least) & (now - state.time <= self.patience)
 
     def _expect(self, state: TrackState, measured: Measurement) -> Prediction:
         """What is expected in place of what was measured."""
@@ -263,13 +263,13 @@ class Track(ABC):
             for i, row in enumerate(expected.covariance)
         ]
         return state._replace(
-            motion=_packed(mean, covariance), time=torch.maximum(state.time, time), count=state.count + 1
+            motion=_packed(mean, covariance), time=torch.maximum(state.time, time), used=state.used + 1
         )
 
     def _sorted(self, state: TrackState, measured: Measurement, now: Tensor, fits: Tensor) -> TrackState:
         """`add` where rows differ: in some the motion begins, in some there is no measurement, or a useless one."""
         time, pos, _ = measured
-        given, known = ~time.isnan(), state.count > 0
+        given, known = ~time.isnan(), state.used > 0
         usable = (pos.abs().amax(-1) <= LARGEST) & (time <= now + CLOCKS) & (time.abs() <= LARGEST)
         usable = usable & ~(time < state.time - self.oldest)
         # What is no number must not reach what is computed of rows that do not use it: gradients would see it.
@@ -285,7 +285,7 @@ class Track(ABC):
         kept = (where_rows(fits, new, old) for new, old in zip(used, state, strict=True))
         found = TrackState(*(where_rows(begins, new, old) for new, old in zip(begun, kept, strict=True)))
         return found._replace(
-            time=torch.where(found.count > 0, found.time, -torch.inf),
+            time=torch.where(found.used > 0, found.time, -torch.inf),
             rejected=state.rejected + (given & ~fits & ~begins),
         )
 
@@ -305,8 +305,8 @@ class Track(ABC):
             begin=torch.where(lost, time, state.begin),
             since=time,
             before=torch.cat(before).movedim(0, -1),
-            count=torch.where(lost, 0, state.count) + 1,
-            restarts=state.restarts + (state.count > 0),
+            used=torch.where(lost, 0, state.used) + 1,
+            restarts=state.restarts + (state.used > 0),
             rejected=state.rejected,
         )
 

@@ -65,7 +65,8 @@ class TrackedPlanner(PretrainedPlanner, Remembering):
         self.planner, self.track, self.control_step, self.history = planner, track, control_step, history
         own: list[Any] = [(keys.PLAN, name) for name in NAMES]
         seen = [key for key in planner.in_keys if key not in SHOWN]
-        self.in_keys = list(dict.fromkeys([keys.TARGET_POS, keys.STEP_COUNT, *seen, *own]))
+        read_keys: list[Any] = list(dict.fromkeys([keys.TARGET_POS, keys.STEP_COUNT, *seen, *own]))
+        self.in_keys = read_keys
         reported = [(keys.PLAN, name) for name in (AGE, DEVIATION)]
         self.out_keys = keys_written(planner, *own, *reported)
 
@@ -103,7 +104,8 @@ class TrackedPlanner(PretrainedPlanner, Remembering):
 
     def with_planner(self, planner: Callable[[TensorDictBase], TensorDictBase]) -> Self:
         """The same track before another planner."""
-        return type(self)(**(self.part_settings() | {"planner": planner})).train(self.training)
+        settings: dict[str, Any] = self.part_settings() | {"planner": planner}
+        return type(self)(**settings).train(self.training)
 
     def for_inference(self) -> Self:
         """The same on copies of the planner's networks as they are now, in as few operations as possible."""
