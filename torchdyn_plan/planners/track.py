@@ -195,15 +195,15 @@ class Track(ABC):
         if pos.shape != (*time.shape, 3) or time.shape != state.time.shape:
             check_trailing_shape("time of a measurement", time, *state.time.shape)
             check_trailing_shape("pos of a measurement", pos, *state.time.shape, 3)
+        # A camera is slower than the loop: at most steps nothing comes.
+        if not hides_values(time) and debug_unwrap(time).isnan().all():
+            return state
         measured = Measurement(time, pos, self.noise**2 if variance is None else variance)
         expected = self._expect(state, measured)
         # A comparison with what is no number, or with a row of which nothing is known, is false.
         fits = (self._fit(expected).all(0) & (expected.passed[0] >= -self.oldest)) & (time <= now + CLOCKS)
-        if not hides_values(fits):
-            if debug_unwrap(fits).all():
-                return self._used(state, expected, time)
-            if debug_unwrap(time).isnan().all():
-                return state
+        if not hides_values(fits) and debug_unwrap(fits).all():
+            return self._used(state, expected, time)
         return self._sorted(state, measured, now, fits)
 
     def at(self, state: TrackState, now: Tensor) -> TrackState:
