@@ -19,6 +19,7 @@ from typing import Any
 import torch
 from tqdm import tqdm
 
+from torchdyn_plan.envs.sensor import Sensor
 from torchdyn_plan.evaluation.episodes import find_truth, run_episodes
 from torchdyn_plan.evaluation.intervals import paired_loss, rate
 from torchdyn_plan.evaluation.results import EpisodeOutcomes
@@ -135,8 +136,8 @@ class Setting:
         made = self.task.planner(name, self.static, chunk=chunk, static_chunk=static_chunk)
         return made.with_parts(**parts) if parts else made
 
-    def play(self, planner: Any, name: str) -> EpisodeOutcomes:
-        """Outcomes of the episodes under ``planner``."""
+    def play(self, planner: Any, name: str, sensor: Sensor | None = None) -> EpisodeOutcomes:
+        """Outcomes of the episodes under ``planner``, whose targets are measured by ``sensor``; exactly for None."""
         arguments = self.arguments
         return run_episodes(
             planner,
@@ -148,6 +149,7 @@ class Setting:
             split=arguments.split,
             num_envs=arguments.num_envs,
             num_threads=arguments.threads,
+            sensor=sensor,
             name=name,
         )
 

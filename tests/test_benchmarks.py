@@ -3,6 +3,8 @@
 import importlib
 import importlib.util
 import json
+import subprocess
+import sys
 from pathlib import Path
 
 import pytest
@@ -14,6 +16,7 @@ BENCHMARKS = Path(__file__).parent.parent / "benchmarks"
 SMALL = {
     "ablation": "--velocities 3 --episodes 2 --num-envs 2 --split dev",
     "braking": "--episodes 2 --num-envs 2 --threads 1",
+    "arrival_time": "--batches 2 --cases 3 --seconds 0.01",
     "calibration": "--episodes 8 --pursuit-episodes 8 --split dev",
     "ceiling": "--velocities 5 --episodes 3 --spacing 60 --meetings 1 --leads 7 --rows 64 --split dev",
     "count_calls": "--planners corner --batch 2",
@@ -31,8 +34,10 @@ SMALL = {
     "reach_env": "--copies 2 --steps 4 --threads 1",
     "recovery": "--planners wait_and_drop --statics ik --velocities 5 --episodes 2 --num-envs 2 --split dev",
     "schedules": "--planners wait_and_drop --velocities 3 --schedules paper --episodes 4",
+    "sensors": "--velocities 3 --episodes 2 --num-envs 2 --planners untrained --tracks kalman held",
     "static_task": "--episodes 8 --split dev",
     "worst_case": "--planners corner --statics ik --calls 40 --seconds 1",
+    "track": "--batches 1 2 --seconds 0.01",
 }
 ELSEWHERE = {
     "descriptions",

@@ -169,6 +169,8 @@ BAD = [
     (["evaluate", "--velocity", "-1"], "velocity must be in [0, 20], got -1.0"),
     (["evaluate", "--velocity", "nan"], "velocity must be a finite number, got nan"),
     (["evaluate", "--friction", "-0.5"], "friction must be in [0, 1000], got -0.5"),
+    (["evaluate", "--sensor.noise", "-0.1"], "noise must be in [0, 10], got -0.1"),
+    (["evaluate", "--sensor.rate", "0"], "rate must be in [1, 10000], got 0.0"),
     (["evaluate", "--latency-ms", "10"], "latency_ms must be whole control steps of 4 ms, got 10"),
     (["evaluate", "--task", "fetch_reach", "--latency-ms", "20"], "latency_ms must be whole control steps of 40 ms"),
     (["evaluate", "--latency-ms", "-4"], "latency_ms must be >= 0, got -4.0"),

@@ -13,6 +13,10 @@ TARGET_HISTORY = "target_history"
 HISTORY_LENGTH = "history_length"
 TARGET_FUTURE = "target_future"
 TRUE_FUTURE = "true_future"
+MEASURED_POS = "measured_pos"
+MEASURED_TIME = "measured_time"
+TRUE_TARGET_POS = "true_target_pos"
+TARGET_COVARIANCE = "target_covariance"
 ROBOT_STATE = "robot_state"
 OBSERVATION = "observation"
 ACHIEVED_GOAL = "achieved_goal"
@@ -33,7 +37,8 @@ class Key:
 
     name: str
     shape: tuple[str | int, ...]
-    """Trailing shape after the batch: N joints, A action size, H history, F horizon, S robot state size."""
+    """Trailing shape after the batch: N joints, A action size, H history, F horizon, S robot state size, M measurements
+    that can come at a step."""
     meaning: str
     writer: str
 
@@ -54,6 +59,15 @@ KEYS: tuple[Key, ...] = (
     Key(name=GOAL, shape=(3,), meaning="place the static planner is sent to [m, world]", writer="planner"),
     Key(name=ARRIVAL_STEPS, shape=(), meaning="control steps from now to the meeting", writer="planner"),
     Key(name=ACTION, shape=("A",), meaning="what the robot is told to do, each entry -1 to 1", writer="static planner"),
+    Key(
+        name=MEASURED_POS,
+        shape=("M", 3),
+        meaning="measurements that come now [m, world]",
+        writer="sensor",
+    ),
+    Key(name=MEASURED_TIME, shape=("M",), meaning="when they were taken [s since the reset]", writer="sensor"),
+    Key(name=TRUE_TARGET_POS, shape=(3,), meaning="the target itself, for those who judge [m, world]", writer="sensor"),
+    Key(name=TARGET_COVARIANCE, shape=(2, 2), meaning="of position and velocity [m², m²/s, m²/s²]", writer="track"),
     Key(name=TARGET_FUTURE, shape=("F", 3), meaning="recorded truth, from step 0 on [m, world]", writer="evaluation"),
     Key(name=TRUE_FUTURE, shape=("F", 3), meaning="the truth from the next step on [m, world]", writer="evaluation"),
     Key(name=PLAN, shape=(), meaning="the planner's memory between steps (nested)", writer="planner"),

@@ -58,6 +58,7 @@ class EpisodeArguments(Arguments):
     """Threads of the simulation, 0 for all cores; does not change the results."""
     latency_ms: float = 0.0
     """Time by which every plan comes late, whole control steps; planners that make no plans have none."""
+    sensor: Any = None
     compensate: bool = True
     """Tell the planners of that time, so that they plan for the moment when the plan is there."""
     overwrite: bool = False

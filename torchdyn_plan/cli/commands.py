@@ -29,6 +29,7 @@ from torchdyn_plan.errors import InputError, OutputError
 from torchdyn_plan.tasks import Task
 
 if TYPE_CHECKING:
+    from torchdyn_plan.envs.sensor import Sensor
     from torchdyn_plan.planners import Delivery
 
 
@@ -187,10 +188,19 @@ def _shared(task: Task, arguments: EpisodeArguments) -> dict[str, Any]:
         "num_envs": arguments.num_envs,
         "num_threads": arguments.threads,
         "delivery": _delivery(task, arguments),
+        "sensor": _sensor(arguments),
         "weights": arguments.weights,
         "overwrite": arguments.overwrite,
         **asdict(arguments.settings),
     }
+
+
+def _sensor(arguments: EpisodeArguments) -> Sensor | None:
+    """How targets are measured; None if exactly."""
+    from torchdyn_plan.envs.sensor import Sensor
+
+    sensor = Sensor(**asdict(arguments.sensor))
+    return None if sensor.is_exact else sensor
 
 
 def _delivery(task: Task, arguments: EpisodeArguments) -> Delivery | None:

@@ -19,6 +19,7 @@ from torchdyn_plan.cli.arguments import (
     ReplanArguments,
     SweepArguments,
 )
+from torchdyn_plan.envs.sensor import Sensor
 from torchdyn_plan.errors import InputError
 from torchdyn_plan.tasks import DEFAULT, Task, task_names
 
@@ -126,6 +127,7 @@ def _episode_form(base: type[EpisodeArguments], task: Task, named: str, **own: A
         planners=planners,
         static=_static_option(task, "Static planner that drives the robot."),
         settings=_group(_settings_form(task)),
+        sensor=_prefixed(_plain(Sensor)),
         **own,
     )
 
@@ -188,6 +190,11 @@ def _group(kind: type[Any]) -> tuple[Any, Any]:
     import tyro
 
     return typing.Annotated[kind, tyro.conf.OmitArgPrefixes], dataclasses.field(default_factory=kind)
+
+
+def _prefixed(kind: type[Any]) -> tuple[Any, Any]:
+    """Type and field of the options that the dataclass ``kind`` has, behind the field's name and a point."""
+    return kind, dataclasses.field(default_factory=kind)
 
 
 def _form(base: type[Any] | None, summary: str = "", **options: tuple[Any, Any]) -> type[Any]:

@@ -10,6 +10,7 @@ if TYPE_CHECKING:
     from torchdyn_plan.envs.episodes import draw_uniform
     from torchdyn_plan.envs.fetch_reach import DynamicReachEnv, FetchSimulation
     from torchdyn_plan.envs.moving_target import MovingTargetEnv, RobotReading
+    from torchdyn_plan.envs.sensor import Sensor
     from torchdyn_plan.envs.trapper import TrapperEnv, TrapperGoalEnv, TrapperScene, TrapperSimulation
 
 _PLACES = {
@@ -19,6 +20,7 @@ _PLACES = {
     "FetchSimulation": "fetch_reach",
     "MovingTargetEnv": "moving_target",
     "RobotReading": "moving_target",
+    "Sensor": "sensor",
     "TrapperEnv": "trapper",
     "TrapperGoalEnv": "trapper",
     "TrapperScene": "trapper",
@@ -34,6 +36,7 @@ __all__ = [
     "FetchSimulation",
     "MovingTargetEnv",
     "RobotReading",
+    "Sensor",
     "TrapperEnv",
     "TrapperGoalEnv",
     "TrapperScene",

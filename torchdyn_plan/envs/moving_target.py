@@ -17,6 +17,8 @@ from torchrl.envs import EnvBase
 from torchdyn_plan import keys
 from torchdyn_plan.checks import check_choice, check_finite, check_number, check_trailing_shape
 from torchdyn_plan.envs.episodes import SPLITS, somewhere
+from torchdyn_plan.envs.sensing import Sensed, Sensing
+from torchdyn_plan.envs.sensor import Sensor
 from torchdyn_plan.envs.specs import flag_spec, observation_spec
 from torchdyn_plan.errors import InputError
 
@@ -77,6 +79,8 @@ class MovingTargetEnv(EnvBase):
         goal_in_observation: bool = False,
         render_mode: str | None = None,
         on_bad_action: str = "raise",
+        control_step: float | None = None,
+        sensor: Sensor | None = None,
         device: torch.device | str = "cpu",
     ) -> None:
         """Declare the keys, with nothing started yet.
@@ -97,6 +101,10 @@ class MovingTargetEnv(EnvBase):
             render_mode: ``rgb_array`` for pictures by `render`; None for none.
             on_bad_action: what becomes of an action that is no number: ``raise`` for an `InputError` before anything
                 moves, ``hold`` for an action of 0 in that row.
+            control_step: time between two actions [s]; a sensor needs it.
+            sensor: how the target is measured; exactly for None. With another one `target_pos` is the newest
+                measurement, `target_history` what was shown so at the last control steps, and `measured_pos`,
+                `measured_time` and `true_target_pos` are shown beside. Rewards and flags go by the truth.
             device: where entries are shown and actions are expected; the simulation stays on the CPU.
 
         Raises:
@@ -114,13 +122,16 @@ class MovingTargetEnv(EnvBase):
         super().__init__(device=torch.device(device), batch_size=torch.Size([num_envs]))
         self.static_target, self.history, self.max_steps = static_target, history, max_steps
         self.split, self.goal_in_observation, self.render_mode = split, goal_in_observation, render_mode
-        self.on_bad_action = on_bad_action
+        self.on_bad_action, self.control_step, self.sensor = on_bad_action, control_step, sensor
         self._process = os.getpid()
         self._begin_series(seed)
         self._episode = torch.zeros(num_envs, dtype=torch.int64)
         # TorchRL's StepCounter and CatFrames would do the next two, at several times the cost of a step.
         self._steps = torch.zeros(num_envs, dtype=torch.int64)
         self._trace = torch.zeros(num_envs, history, 3)
+        self._sensing = self._make_sensing()
+        if self._sensing is not None:
+            self._held_trace, self._sensed = self._trace.clone(), self._sensing.nothing()
         shown = 0 if not goal_in_observation else 3 if static_target else 6
         self.observation_spec = observation_spec(
             num_envs,
@@ -130,12 +141,26 @@ class MovingTargetEnv(EnvBase):
             history=history,
             flags=self.flags,
             static_target=static_target,
+            measurements=0 if self._sensing is None else self._sensing.slots,
         ).to(self.device)
         action = Bounded(-1.0, 1.0, shape=torch.Size((num_envs, action_size)), dtype=torch.float32)
         self.action_spec = action.to(self.device)
         self.reward_spec = Unbounded(torch.Size((num_envs, 1))).to(self.device)
         ends = Composite({key: flag_spec(num_envs) for key in ENDS}, shape=(num_envs,))
         self.done_spec = ends.to(self.device)
+
+    def _make_sensing(self) -> Sensing | None:
+        """The batch's sensors; None where the target is seen exactly."""
+        sensor = self.sensor
+        if sensor is not None and not isinstance(sensor, Sensor):
+            raise InputError(f"sensor must be a Sensor or None, got {type(sensor).__name__}")
+        if sensor is None or sensor.is_exact:
+            return None
+        if self.static_target:
+            raise InputError("sensor must be None with static_target: a goal that rests is told, and not measured")
+        if self.control_step is None:
+            raise InputError(f"{type(self).__name__} needs its control_step [s] for a sensor, got None")
+        return Sensing(sensor, self.num_envs, control_step=self.control_step, max_steps=self.max_steps)
 
     @abstractmethod
     def _start(self, rows: Tensor, episodes: Tensor) -> Tensor:
@@ -276,7 +301,10 @@ class MovingTargetEnv(EnvBase):
         if len(rows):
             episodes = self._take_episodes(rows)
             self._episode[rows], self._steps[rows] = episodes, 0
-            self._trace[rows] = self._start(rows, episodes).unsqueeze(1)
+            place = self._start(rows, episodes)
+            self._trace[rows] = place.unsqueeze(1)
+            if self._sensing is not None:
+                self._start_sensing(self._sensing, rows, episodes, place)
         return self._shown(self._observe() | {key: torch.zeros(self.num_envs, 1, dtype=torch.bool) for key in ENDS})
 
     def _step(self, tensordict: TensorDictBase) -> TensorDictBase:
@@ -314,6 +342,15 @@ class MovingTargetEnv(EnvBase):
         """Add ``target`` (N, 3) float32 to the history, and count a step."""
         self._steps += 1
         self._trace = torch.cat([self._trace[:, 1:], target.unsqueeze(1)], dim=1)
+        if self._sensing is not None:
+            self._sensed = self._sensing.see(self._steps, self._trace[:, -2], self._trace[:, -1])
+            self._held_trace = torch.cat([self._held_trace[:, 1:], self._sensed.held.unsqueeze(1)], dim=1)
+
+    def _start_sensing(self, sensing: Sensing, rows: Tensor, episodes: Tensor, place: Tensor) -> None:
+        """Show ``rows`` (M,) the first measurements of ``episodes`` (M,), whose targets are at ``place`` (M, 3)."""
+        first = sensing.start(rows, episodes, place, split=self.split, seed=self.seed)
+        self._held_trace[rows] = first.held.unsqueeze(1)
+        self._sensed = Sensed(*(old.index_copy(0, rows, new) for old, new in zip(self._sensed, first, strict=True)))
 
     @property
     def _is_over(self) -> Tensor:
@@ -335,7 +372,7 @@ class MovingTargetEnv(EnvBase):
 
     def _observe(self) -> dict[str, Tensor]:
         """What is seen now, on the CPU; every entry has a memory of its own."""
-        robot, history = self._robot(), self._trace.clone()
+        robot, history = self._robot(), (self._trace if self._sensing is None else self._held_trace).clone()
         target = history[:, -1].clone()
         observation = [robot.state]
         if self.goal_in_observation:
@@ -359,4 +396,7 @@ class MovingTargetEnv(EnvBase):
         entries |= {key: flag.unsqueeze(-1).clone() for key, flag in self._flags().items()}
         if self.static_target:
             entries[keys.GOAL] = target.clone()
+        if self._sensing is not None:
+            entries[keys.MEASURED_POS], entries[keys.MEASURED_TIME] = self._sensed.pos, self._sensed.time
+            entries[keys.TRUE_TARGET_POS] = self._trace[:, -1].clone()
         return entries

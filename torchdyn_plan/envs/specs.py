@@ -24,8 +24,12 @@ def observation_spec(
     history: int,
     flags: tuple[str, ...],
     static_target: bool,
+    measurements: int = 0,
 ) -> Composite:
-    """What is observed in ``num_envs`` environments; arguments as of `torchdyn_plan.envs.MovingTargetEnv`."""
+    """What is observed in ``num_envs`` environments; arguments as of `torchdyn_plan.envs.MovingTargetEnv`.
+
+    ``measurements`` is how many can come at a step, 0 where the target is seen exactly.
+    """
     vectors: dict[str, tuple[int, ...]] = {
         keys.TOOL_POS: (3,),
         keys.TARGET_POS: (3,),
@@ -39,6 +43,9 @@ def observation_spec(
         vectors |= {keys.JOINT_POS: (joints,), keys.JOINT_VEL: (joints,)}
     if static_target:
         vectors[keys.GOAL] = (3,)
+    if measurements:
+        vectors[keys.MEASURED_POS], vectors[keys.MEASURED_TIME] = (measurements, 3), (measurements,)
+        vectors[keys.TRUE_TARGET_POS] = (3,)
     specs: dict[str, Any] = {key: Unbounded(torch.Size((num_envs, *shape))) for key, shape in vectors.items()}
     for key in (keys.HISTORY_LENGTH, keys.EPISODE):
         specs[key] = Unbounded(torch.Size((num_envs,)), dtype=torch.int64)

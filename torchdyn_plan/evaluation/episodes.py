@@ -13,8 +13,9 @@ from torch import Tensor
 
 from torchdyn_plan import keys
 from torchdyn_plan.envs.moving_target import MovingTargetEnv
+from torchdyn_plan.envs.sensor import Sensor
 from torchdyn_plan.evaluation.results import NO_CAUSE, EpisodeOutcomes
-from torchdyn_plan.evaluation.traces import Trace, TraceLog
+from torchdyn_plan.evaluation.traces import Trace, TraceLog, true_target
 from torchdyn_plan.progress import progress_bar
 from torchdyn_plan.tasks.task import Task, Truth, Verdict
 
@@ -139,8 +140,10 @@ class ShownTruth:
             self._path = self.recorded[episode].clone()
         self._path[new], self._episode = self.recorded[episode[new]], episode.clone()
         rows, length = torch.arange(len(step)), self._path.shape[1]
-        off = (self._path[rows, step] - seen[keys.TARGET_POS]).norm(dim=-1) > OFF_PATH
-        stale = (off & (step % RENEWED_EVERY == 0)).nonzero().squeeze(-1)
+        off = (self._path[rows, step] - true_target(seen)).norm(dim=-1) > OFF_PATH
+        # Episodes beyond the recorded ones are played until the others have ended, and count for nothing.
+        counts = seen[keys.EPISODE] < len(self.recorded)
+        stale = (off & counts & (step % RENEWED_EVERY == 0)).nonzero().squeeze(-1)
         if len(stale):
             # As long as the row that has most to come needs it.
             steps = length - 1 - int(step[stale].min())
@@ -218,6 +221,7 @@ def run_episodes(
     split: str = "test",
     num_envs: int = 64,
     num_threads: int = 0,
+    sensor: Sensor | None = None,
     name: str = "",
     progress: bool = True,
 ) -> EpisodeOutcomes:
@@ -233,11 +237,15 @@ def run_episodes(
         split: which family of series.
         num_envs: episodes that run side by side; does not change the outcomes.
         num_threads: of the simulation, 0 for all cores; does not change the outcomes.
+        sensor: how targets are measured; exactly for None.
         name: shown beside the progress bar.
         progress: show the bar.
     """
-    side_by_side = min(num_envs, episodes)
-    env = task.make_env(settings, num_envs=side_by_side, seed=seed, split=split, num_threads=num_threads)
+    batch: dict[str, Any] = {"num_envs": min(num_envs, episodes), "seed": seed, "split": split}
+    if sensor is not None and not sensor.is_exact:
+        # Only who asks for a sensor needs a task that can have one.
+        batch["sensor"] = sensor
+    env = task.make_env(settings, num_threads=num_threads, **batch)
     log = EpisodeLog.empty(episodes, task, env)
     seconds = play_all(planner, env, log, truth.future, name=name, progress=progress)
     verdict = _judge(task, settings, log, truth)

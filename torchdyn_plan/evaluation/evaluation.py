@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from torchdyn_plan.checks import check_seed
+from torchdyn_plan.envs.sensor import Sensor
 from torchdyn_plan.errors import OutputError
 from torchdyn_plan.evaluation.identity import check_evaluation_folder, clear_results
 from torchdyn_plan.evaluation.plots import plot_results
@@ -65,6 +66,7 @@ def evaluate(
     num_envs: int = 64,
     num_threads: int = 0,
     delivery: Delivery | None = None,
+    sensor: Sensor | None = None,
     weights: str | Path | None = None,
     other_scene: bool = False,
     out: str | Path | None = None,
@@ -86,6 +88,7 @@ def evaluate(
         num_threads: of the simulation, 0 for all cores; does not change the results.
         delivery: how plans come into use, `torchdyn_plan.planners.Delayed` for one; planners that make no plans have
             none.
+        sensor: how targets are measured; exactly for None.
         weights: folder of the networks of named planners, as ``train`` leaves it; those that ship for None.
         other_scene: let planners of another scene play, too.
         out: folder in which the results are saved as soon as they are there; it is looked at before anything runs.
@@ -108,6 +111,7 @@ def evaluate(
         static=static,
         weights=weights,
         delivery=delivery,
+        sensor=sensor,
         other_scene=other_scene,
         episodes=episodes,
         split=split,

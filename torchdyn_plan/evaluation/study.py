@@ -10,10 +10,11 @@ from pathlib import Path
 from typing import Any
 
 from torchdyn_plan.checks import check_choice, check_count, check_threads
+from torchdyn_plan.envs.sensor import Sensor
 from torchdyn_plan.errors import InputError
 from torchdyn_plan.evaluation.episodes import Planner, find_truth, run_episodes
 from torchdyn_plan.evaluation.results import EpisodeOutcomes, ResultRow, summarize
-from torchdyn_plan.planners import Delivery, DynamicPlanner
+from torchdyn_plan.planners import Delivery, DynamicPlanner, TrackedPlanner
 from torchdyn_plan.planners.pretrained import planner_digest
 from torchdyn_plan.tasks.task import Settings, Task
 from torchdyn_plan.threads import one_thread
@@ -38,6 +39,8 @@ class Study:
     num_envs: int = 64
     num_threads: int = 0
     delivery: Delivery | None = None
+    sensor: Sensor | None = None
+    """How targets are measured; exactly for None."""
     progress: bool = True
 
     def __post_init__(self) -> None:
@@ -87,7 +90,7 @@ class Study:
         }
         with one_thread():
             truth = find_truth(self.task, settings, static=self.static, **shared)
-            shared |= {"num_envs": self.num_envs, "progress": self.progress}
+            shared |= {"num_envs": self.num_envs, "progress": self.progress, "sensor": self.sensor}
             return {
                 name: run_episodes(planner, self.task, settings, truth, name=name, **shared)
                 for name, planner in self.planners.items()
@@ -103,7 +106,10 @@ class Study:
         counts = {name: getattr(self, name) for name in ("episodes", "split", "num_envs", "num_threads")}
         delivery = None if self.delivery is None else repr(self.delivery)
         about = {"task": self.task.name, "planners": list(self.planners), "static": self.static}
-        return about | counts | {"delivery": delivery, "scene": self.task.digest(), "weights": dict(self.weights)}
+        # Folders of results from before there were sensors say nothing of them.
+        sensor = {} if self.sensor is None or self.sensor.is_exact else {"sensor": self.sensor.told()}
+        whole = {"delivery": delivery, "scene": self.task.digest(), "weights": dict(self.weights)}
+        return about | counts | whole | sensor
 
     @cached_property
     def weights(self) -> Mapping[str, str | None]:
@@ -138,4 +144,6 @@ def _check_scenes(task: Task, planners: Mapping[str, Planner]) -> None:
 
 def _delivered(planner: Planner, delivery: Delivery) -> Planner:
     """The same planner whose plans come by ``delivery``; one that makes no plans as it is."""
+    if isinstance(planner, TrackedPlanner):
+        return planner.with_planner(_delivered(planner.planner, delivery))
     return planner.with_parts(delivery=delivery) if isinstance(planner, DynamicPlanner) else planner

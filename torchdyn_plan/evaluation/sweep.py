@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import Any, TypedDict
 
 from torchdyn_plan.checks import check_choice, check_count, check_seed
+from torchdyn_plan.envs.sensor import Sensor
 from torchdyn_plan.errors import InputError
 from torchdyn_plan.evaluation.identity import (
     POINTS,
@@ -54,6 +55,7 @@ def sweep(
     num_envs: int = 64,
     num_threads: int = 0,
     delivery: Delivery | None = None,
+    sensor: Sensor | None = None,
     weights: str | Path | None = None,
     other_scene: bool = False,
     overwrite: bool = False,
@@ -78,6 +80,7 @@ def sweep(
         num_envs: episodes that run side by side.
         num_threads: of the simulation, 0 for all cores.
         delivery: how plans come into use.
+        sensor: how targets are measured.
         weights: folder of the networks of named planners.
         other_scene: let planners of another scene play, too.
         overwrite: remove whatever results are in the folder, points of this sweep among them.
@@ -104,6 +107,7 @@ def sweep(
         static=static,
         weights=weights,
         delivery=delivery,
+        sensor=sensor,
         other_scene=other_scene,
         episodes=episodes,
         split=split,

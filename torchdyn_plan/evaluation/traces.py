@@ -88,7 +88,13 @@ def _shown(observed: TensorDictBase) -> list[Tensor]:
     tool_pos: Tensor = observed.get(keys.TOOL_POS)
     joint_vel = observed.get(keys.JOINT_VEL, None)
     speed = torch.zeros_like(tool_pos[:, :1]) if joint_vel is None else joint_vel.abs().amax(-1, keepdim=True)
-    return [tool_pos, observed.get(keys.TARGET_POS), speed]
+    return [tool_pos, true_target(observed), speed]
+
+
+def true_target(tensordict: TensorDictBase) -> Tensor:
+    """Where targets are, ``(*B, 3)`` [m, world], whatever a sensor makes of it."""
+    truth = tensordict.get(keys.TRUE_TARGET_POS, None)
+    return tensordict[keys.TARGET_POS] if truth is None else truth
 
 
 def _split(record: Tensor, length: Tensor) -> Trace:

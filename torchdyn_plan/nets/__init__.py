@@ -1,5 +1,7 @@
 """Networks: where the target will be, how sure that is, when the robot can be there, and a policy to take it there."""
 
+from torchdyn_plan.nets.analytic import Ballistic, Billiard, ConstantVelocity
+from torchdyn_plan.nets.analytic_arrival import AnalyticArrival, GoalJoints, SolvedJoints
 from torchdyn_plan.nets.arrival import ArrivalModel, ArrivalQuery, FunctionArrival
 from torchdyn_plan.nets.distributions import ESTIMATORS, Arrival, Spread
 from torchdyn_plan.nets.eta import ETAConfig, ETANetwork
@@ -11,9 +13,13 @@ from torchdyn_plan.nets.spread import SpreadConfig, SpreadForecaster, SpreadNetw
 __all__ = [
     "ESTIMATORS",
     "Actor",
+    "AnalyticArrival",
     "Arrival",
     "ArrivalModel",
     "ArrivalQuery",
+    "Ballistic",
+    "Billiard",
+    "ConstantVelocity",
     "Critic",
     "DescribedForecast",
     "ETAConfig",
@@ -24,7 +30,9 @@ __all__ = [
     "ForecasterConfig",
     "FunctionArrival",
     "FunctionForecast",
+    "GoalJoints",
     "PolicyConfig",
+    "SolvedJoints",
     "Spread",
     "SpreadConfig",
     "SpreadForecaster",

@@ -31,6 +31,8 @@ from torchdyn_plan.planners.static.callable import CallablePlanner
 from torchdyn_plan.planners.static.ik import IKPlanner
 from torchdyn_plan.planners.static.policy import PolicyPlanner
 from torchdyn_plan.planners.static.proportional import ProportionalController
+from torchdyn_plan.planners.track import KalmanTrack, LeastSquaresTrack, Track, TrackState
+from torchdyn_plan.planners.tracked import TrackedPlanner
 
 __all__ = [
     "Approach",
@@ -46,6 +48,8 @@ __all__ = [
     "GoTo",
     "GoalSearch",
     "IKPlanner",
+    "KalmanTrack",
+    "LeastSquaresTrack",
     "Lost",
     "LostBelow",
     "Maneuver",
@@ -64,6 +68,9 @@ __all__ = [
     "StaticPlanner",
     "StraightToGoal",
     "TargetPursuit",
+    "Track",
+    "TrackState",
+    "TrackedPlanner",
     "measured_latency",
     "observe",
     "oracle_trajectory",

@@ -33,6 +33,8 @@ class PlanStatus(IntEnum):
     """The target is lost."""
     BAD_INPUT = 5
     """Something that is read of the target or the robot is no number, or too large to be a measurement."""
+    NO_TRACK = 6
+    """Too little was measured of the target, or too long ago, to know where it is."""
 
 
 class Lost(Protocol):

@@ -152,7 +152,7 @@ class Task:
     control_step: float
     """Time between two actions [s]."""
     make_env: Callable[..., MovingTargetEnv]
-    """``(settings, *, num_envs, seed, split, num_threads)`` to the environment."""
+    """``(settings, *, num_envs, seed, split, num_threads)`` to the environment; and ``sensor`` where there is one."""
     digest: Callable[[], str]
     """Hash of the scene: what data, weights and planners belong to."""
     static_planners: Mapping[str, Callable[..., Any]]

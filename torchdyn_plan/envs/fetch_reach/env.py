@@ -12,9 +12,10 @@ from torch import Tensor
 from torchdyn_plan.checks import check_choice, check_number
 from torchdyn_plan.envs.fetch_reach.goal_motion import MOTIONS, GoalStarts, draw_goals, goal_places
 from torchdyn_plan.envs.fetch_reach.keys import REACHED
-from torchdyn_plan.envs.fetch_reach.simulation import ARM_JOINTS, FetchSimulation, fetch_digest
+from torchdyn_plan.envs.fetch_reach.simulation import ARM_JOINTS, CONTROL_STEP, FetchSimulation, fetch_digest
 from torchdyn_plan.envs.moving_target import MovingTargetEnv, RobotReading
 from torchdyn_plan.envs.painter import Painter, Sphere
+from torchdyn_plan.envs.sensor import Sensor
 
 MAX_STEPS = 50
 """Control steps of an episode: two seconds."""
@@ -66,6 +67,7 @@ class DynamicReachEnv(MovingTargetEnv):
         goal_in_observation: bool = False,
         render_mode: str | None = None,
         on_bad_action: str = "raise",
+        sensor: Sensor | None = None,
         device: torch.device | str = "cpu",
     ) -> None:
         """Build the batch.
@@ -86,6 +88,7 @@ class DynamicReachEnv(MovingTargetEnv):
             goal_in_observation: `observation` ends with the goal's place and, if it moves, with its last step.
             render_mode: ``rgb_array`` for pictures by `render`.
             on_bad_action: ``raise`` an `InputError` for an action that is no number, or ``hold``: 0 in its row.
+            sensor: how the goal is measured; exactly for None.
             device: where entries are shown and actions are expected; the simulation stays on the CPU.
 
         Raises:
@@ -111,6 +114,8 @@ class DynamicReachEnv(MovingTargetEnv):
             goal_in_observation=goal_in_observation,
             render_mode=render_mode,
             on_bad_action=on_bad_action,
+            control_step=CONTROL_STEP,
+            sensor=sensor,
             device=device,
         )
         self.scene_digest = fetch_digest()

@@ -12,6 +12,7 @@ from torch import Tensor, nn
 from torchdyn_plan.checks import check_number
 from torchdyn_plan.envs.moving_target import MovingTargetEnv, RobotReading
 from torchdyn_plan.envs.painter import Painter, Sphere
+from torchdyn_plan.envs.sensor import Sensor
 from torchdyn_plan.envs.trapper.contact import is_covered, is_pocketed
 from torchdyn_plan.envs.trapper.keys import POCKETED, TRAPPED
 from torchdyn_plan.envs.trapper.reward import GoalReward, goal_reward
@@ -62,6 +63,7 @@ class TrapperEnv(MovingTargetEnv):
         goal_in_observation: bool = False,
         render_mode: str | None = None,
         on_bad_action: str = "raise",
+        sensor: Sensor | None = None,
         device: torch.device | str = "cpu",
     ) -> None:
         """Build the batch.
@@ -81,6 +83,7 @@ class TrapperEnv(MovingTargetEnv):
             goal_in_observation: `observation` ends with the ball's place and, if it rolls, with its last step.
             render_mode: ``rgb_array`` for pictures by `render`.
             on_bad_action: ``raise`` an `InputError` for an action that is no number, or ``hold``: 0 in its row.
+            sensor: how the ball is measured; exactly for None.
             device: where entries are shown and actions are expected; the simulation stays on the CPU.
 
         Raises:
@@ -88,6 +91,7 @@ class TrapperEnv(MovingTargetEnv):
         """
         check_number("velocity", velocity, minimum=0.0, maximum=20.0)
         check_number("friction", friction, minimum=0.0)
+        scene = trapper_scene(scene)
         super().__init__(
             num_envs,
             joints=6,
@@ -101,9 +105,11 @@ class TrapperEnv(MovingTargetEnv):
             goal_in_observation=goal_in_observation,
             render_mode=render_mode,
             on_bad_action=on_bad_action,
+            control_step=scene.control_step,
+            sensor=sensor,
             device=device,
         )
-        self.scene, self.weights = trapper_scene(scene), weights or GoalReward()
+        self.scene, self.weights = scene, weights or GoalReward()
         self.scene_digest = self.scene.digest()
         self.velocity, self.friction = 0.0 if static_target else velocity, friction
         self.simulation = TrapperSimulation(num_envs, self.scene, friction=friction, num_threads=num_threads)

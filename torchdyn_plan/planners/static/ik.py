@@ -39,6 +39,12 @@ class Path(NamedTuple):
 
 PASSES = 2
 """Times that a step is solved anew without the joints that it would push out of their limits."""
+GOAL_STEPS, GOAL_STEP = 10, 0.5
+"""Steps in which the end of a path is found, and the most that a joint moves in one of them [rad]."""
+GOAL_DAMPING = 0.005
+"""λ of these steps."""
+GOAL_TOLERANCE = 0.015
+"""A tool within this of its goal is there [m]."""
 PATH_NAMES = tuple(f"path_{field}" for field in Path._fields)
 
 
@@ -159,6 +165,33 @@ class IKPlanner(Precise, StaticPlannerModule):
             action, joint_pos = self.step(joint_pos, goal)
             actions.append(action)
         return torch.stack(actions, dim=-2)
+
+    def goal_joints(self, joint_pos: Tensor, goal: Tensor) -> tuple[Tensor, Tensor]:
+        """Where the path from ``joint_pos`` (*B, N) [rad] to ``goal`` (*B, 3) [m, world] ends; differentiable.
+
+        The path is that of the approach in `GOAL_STEPS` long steps, in place of the many of a path that is driven.
+
+        Returns:
+            Joint angles ``(*B, N)`` [rad], and ``(*B,)`` bool: the tool is at the goal then, within `GOAL_TOLERANCE`.
+        """
+        goal = goal.to(self._limit.dtype)
+        q = joint_pos.to(goal.dtype).expand(*goal.shape[:-1], joint_pos.shape[-1])
+        batch, goal = goal.shape[:-1], goal.reshape(-1, 3)
+        q = q.reshape(-1, q.shape[-1])
+        longest = torch.full_like(self._limit, GOAL_STEP)
+        for _ in range(GOAL_STEPS):
+            pose, jacobian = self.arm.pose_and_jacobian(q)
+            error = self._way(pose, goal)
+            step = limited_step(dls_step(jacobian[..., : error.shape[-1], :], error, GOAL_DAMPING), longest, 1.0)
+            q = torch.clamp(q + step, self.arm.lower, self.arm.upper)
+        left = self._way(self.arm(q), goal)[..., :3].norm(dim=-1)
+        outside = (self.approach.within_reach(goal) - goal).norm(dim=-1)
+        reached = (left <= GOAL_TOLERANCE) & (outside <= GOAL_TOLERANCE)
+        return q.view(*batch, -1), reached.view(batch)
+
+    def _way(self, pose: Tensor, goal: Tensor) -> Tensor:
+        """The twist still to go from poses (R, 4, 4) to goals (R, 3)."""
+        return torch.stack(self.approach.twist(pose[..., :3, :].flatten(-2).unbind(-1), goal.unbind(-1)), dim=-1)
 
     def step(self, joint_pos: Tensor, goal: Tensor) -> tuple[Tensor, Tensor]:
         """One step of the path from ``joint_pos`` (*B, N) [rad] towards ``goal`` (*B, 3) [m, world].

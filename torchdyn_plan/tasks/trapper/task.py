@@ -169,6 +169,20 @@ def exact(parts: PlannerParts) -> Any:
 
 def wait_and_drop(parts: PlannerParts) -> Any:
     """Waits above the most promising meeting, and drops in time: the best that there is."""
+    return waits_and_drops(parts, parts.spread_forecaster, parts.eta)
+
+
+def untrained(parts: PlannerParts) -> Any:
+    """The same without any training: with the mechanics of the ball, and the limits of the arm's joints."""
+    from torchdyn_plan.envs.trapper.scene import trapper_scene
+    from torchdyn_plan.tasks.trapper.untrained import arm_arrival, billiard
+
+    scene = trapper_scene(parts.task.scene)
+    return waits_and_drops(parts, billiard(scene), arm_arrival(scene, ik_planner(scene)))
+
+
+def waits_and_drops(parts: PlannerParts, forecaster: Any, eta: Any) -> Any:
+    """A planner that waits and drops, by this forecaster and this model of arrivals."""
     from torchdyn_plan.envs.trapper.scene import trapper_scene
     from torchdyn_plan.planners import DynamicPlanner, ReplanSchedule
     from torchdyn_plan.tasks.trapper.wait_and_drop import WaitAndDrop, waiting_search
@@ -176,7 +190,7 @@ def wait_and_drop(parts: PlannerParts) -> Any:
     scene = trapper_scene(parts.task.scene)
     # Candidates are 5 steps apart: a plan every 5 steps keeps them on the same places, and so the waiting tool still.
     own = {"search": waiting_search(scene), "schedule": ReplanSchedule.every(5), "maneuver": WaitAndDrop.of(scene)}
-    return DynamicPlanner(parts.static, parts.spread_forecaster, parts.eta, **own, **common(parts)).eval()
+    return DynamicPlanner(parts.static, forecaster, eta, **own, **common(parts)).eval()
 
 
 def truth(scene: Scene, settings: TrapperSettings, **episodes: Any) -> Truth:
@@ -272,8 +286,9 @@ def trapper_task(scene: Scene) -> Task:
             "wait_and_drop": wait_and_drop,
             "corner_never": corner_never,
             "recorded_oracle": recorded_oracle,
+            "untrained": untrained,
         },
-        rivals=("corner_never", "recorded_oracle"),
+        rivals=("corner_never", "recorded_oracle", "untrained"),
         truth=partial(truth, scene),
         causes=CAUSES,
         judge=partial(judge, scene),

@@ -1,0 +1,87 @@
+"""What sensors cost, and what a track in front of the planner wins back: learned and untrained, on the same episodes.
+
+    python benchmarks/sensors.py --out benchmarks/results/sensors.json
+
+Each row is one sensor, one velocity and one planner; ``success_solvable`` is over the episodes that can be solved.
+``held`` is the planner that is shown the newest measurement, held from step to step; the others see by a track that is
+told the sensor's noise. A killed run goes on where it was, so that rows can be added a few at a time.
+"""
+
+from __future__ import annotations
+
+import itertools
+from collections.abc import Callable
+from dataclasses import dataclass
+from functools import partial
+from typing import Any
+
+import tyro
+from study import Episodes, Row, Setting, Study, measuring, success_of
+
+from torchdyn_plan.envs.sensor import Sensor
+from torchdyn_plan.planners import DynamicPlanner, KalmanTrack, LeastSquaresTrack, Track, TrackedPlanner
+from torchdyn_plan.tasks import load_task
+
+TASK = "trapper"
+SENSORS = {
+    "exact": Sensor(),
+    "2 mm, 250 Hz": Sensor(noise=0.002),
+    "5 mm, 60 Hz, 20 ms late": Sensor(noise=0.005, rate=60.0, latency=0.02),
+    "5 mm, 30 Hz, 5 % lost, 3 ms jitter": Sensor(noise=0.005, rate=30.0, dropout=0.05, jitter=0.003),
+}
+LEAST_NOISE = 1e-4
+"""A track takes no measurement for better than this [m]: targets do not move as smoothly as its filter says."""
+TRACKS: dict[str, Callable[[float], Track] | None] = {
+    "held": None,
+    "kalman": lambda noise: KalmanTrack(noise=noise),
+    "least_squares": lambda noise: LeastSquaresTrack(noise=noise, window=0.2),
+}
+
+
+@dataclass(frozen=True, kw_only=True)
+class Arguments(Episodes):
+    """Which rows are measured."""
+
+    episodes: int = 200
+    """Episodes for each row."""
+    num_envs: int = 200
+    """Episodes side by side; does not change the figures."""
+    velocities: tuple[float, ...] = (3.0, 1.0, 5.0)
+    """Of the ball at the start [m/s]."""
+    sensors: tuple[str, ...] = tuple(SENSORS)
+    """By name."""
+    planners: tuple[str, ...] = ("wait_and_drop", "untrained")
+    """Of the task."""
+    tracks: tuple[str, ...] = ("kalman", "held", "least_squares")
+    """By name; with ``held`` there is none."""
+
+
+def sees_by(planner: DynamicPlanner, track: str, sensor: Sensor, control_step: float) -> Any:
+    """``planner`` behind the track of that name, told the noise of ``sensor``."""
+    make = TRACKS[track]
+    if make is None:
+        return planner
+    noise = max(sensor.noise, LEAST_NOISE)
+    return TrackedPlanner(planner, make(noise), control_step=control_step)
+
+
+def main(arguments: Arguments) -> None:
+    """Measure every row."""
+    task = load_task(TASK)
+    study = Study(arguments, scene=task.digest())
+    settings = [Setting(task, arguments, velocity=velocity) for velocity in arguments.velocities]
+    cases = itertools.product(arguments.tracks, settings, arguments.sensors, arguments.planners)
+    with measuring():
+        for track, setting, sensor, name in cases:
+            about = setting.about | {"sensor": sensor, "planner": name, "track": track}
+            study.row(about, partial(measure, setting, sensor, name, track))
+
+
+def measure(setting: Setting, sensor: str, name: str, track: str) -> Row:
+    """Success of the task's planner ``name`` behind ``track``, with ``sensor``."""
+    planner = sees_by(setting.planner(name), track, SENSORS[sensor], setting.task.control_step)
+    return success_of(setting.play(planner, name, SENSORS[sensor]))
+
+
+if __name__ == "__main__":
+    main(tyro.cli(Arguments))

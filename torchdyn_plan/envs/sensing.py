@@ -1,0 +1,114 @@
+"""Measurements of a batch of targets, as a sensor takes them: by episode, whatever runs beside it."""
+
+from __future__ import annotations
+
+import math
+from typing import NamedTuple
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from torchdyn_plan.envs.episodes import episode_random
+from torchdyn_plan.envs.sensor import Sensor
+
+STREAM = 2
+"""Which of an episode's streams of random numbers its sensor draws from."""
+LOST = torch.iinfo(torch.int64).max
+"""Control step at which a lost measurement is seen."""
+ROUNDING = 1e-9
+"""Share of a control step that is rounding."""
+
+
+class Sensed(NamedTuple):
+    """What is seen of N targets at one control step."""
+
+    held: Tensor
+    """``(N, 3)`` float32, the newest measurement that is there [m, world]."""
+    pos: Tensor
+    """``(N, M, 3)`` float32 measurements that have come with this step [m, world]; NaN in slots that stay empty."""
+    time: Tensor
+    """``(N, M)`` float32, when they were taken [s since the reset]; NaN in slots that stay empty."""
+
+
+class Sensing:
+    """The sensors of N environments: what has been measured, and what is still on its way.
+
+    All that is random of an episode's measurements is drawn when it starts, as a pure function of (split, seed,
+    episode): results do not depend on how many environments there are.
+    """
+
+    def __init__(self, sensor: Sensor, num_envs: int, *, control_step: float, max_steps: int) -> None:
+        """Lay out the memory for episodes of up to ``max_steps`` control steps of ``control_step`` [s]."""
+        self.sensor, self.control_step = sensor, control_step
+        self.slots = sensor.slots(control_step)
+        self._period = control_step if sensor.rate is None else 1.0 / sensor.rate
+        self._count = math.floor(max_steps * control_step / self._period + ROUNDING) + 1
+        shape = num_envs, self._count
+        self._time = torch.zeros(shape, dtype=torch.float64)
+        self._error = torch.zeros(*shape, 3)
+        self._value = torch.zeros(*shape, 3)
+        self._taken_step = torch.zeros(shape, dtype=torch.int64)
+        self._seen_step = torch.zeros(shape, dtype=torch.int64)
+        self._held = torch.zeros(num_envs, 3)
+
+    def nothing(self) -> Sensed:
+        """What is seen of targets of which nothing has been measured."""
+        shape = len(self._held), self.slots
+        return Sensed(self._held.clone(), torch.full((*shape, 3), torch.nan), torch.full(shape, torch.nan))
+
+    def start(self, rows: Tensor, episodes: Tensor, place: Tensor, *, split: str, seed: int) -> Sensed:
+        """Start ``episodes`` (R,) in ``rows`` (R,); returns what is seen at once of targets at ``place`` (R, 3)."""
+        for row, episode in zip(rows.tolist(), episodes.tolist(), strict=True):
+            self._draw(row, episode_random(split, seed, episode, STREAM))
+        # Jitter may take more than one measurement at the start.
+        early = self._taken_step[rows] == 0
+        which, number = early.nonzero(as_tuple=True)
+        self._value[rows[which], number] = self._measured(place[which], self._error[rows[which], number])
+        self._held[rows] = self._value[rows, 0]
+        comes = torch.zeros_like(self._taken_step, dtype=torch.bool)
+        comes[rows] = self._seen_step[rows] == 0
+        return Sensed(*(value[rows] for value in self._shown(comes)))
+
+    def _draw(self, row: int, draw: np.random.Generator) -> None:
+        """Draw the moments, errors and losses of all measurements of the episode that starts in ``row``."""
+        sensor, count = self.sensor, self._count
+        self._error[row] = torch.from_numpy(sensor.noise * draw.standard_normal((count, 3))).float()
+        moment = self._period * np.arange(count) + sensor.jitter * draw.standard_normal(count)
+        lost = torch.from_numpy(draw.uniform(size=count) < sensor.dropout)
+        moment[0], lost[0] = 0.0, False
+        self._time[row] = torch.from_numpy(np.sort(moment.clip(min=0.0)))
+        self._taken_step[row] = self._step_of(self._time[row])
+        self._seen_step[row] = self._step_of(self._time[row] + sensor.latency).masked_fill(lost, LOST)
+        self._seen_step[row, 0] = 0
+
+    def see(self, step_count: Tensor, before: Tensor, now: Tensor) -> Sensed:
+        """What is seen at control steps ``step_count`` (N,) of targets that were ``before`` and are ``now`` (N, 3)."""
+        step = step_count.unsqueeze(-1)
+        rows, number = ((self._taken_step == step) & (step > 0)).nonzero(as_tuple=True)
+        # A measurement between two control steps is of a place between the two.
+        share = 1.0 - (step_count[rows] - self._time[rows, number] / self.control_step)
+        share = share.masked_fill(share > 1.0 - ROUNDING, 1.0).float().unsqueeze(-1)
+        place = torch.lerp(before[rows], now[rows], share)
+        self._value[rows, number] = self._measured(place, self._error[rows, number])
+        return self._shown(self._seen_step == step)
+
+    def _shown(self, comes: Tensor) -> Sensed:
+        """The measurements that come now, ``(N, count)`` bool, the last `slots` of each row."""
+        left = comes.long().flip(-1).cumsum(-1).flip(-1)
+        rows, number = (comes & (left <= self.slots)).nonzero(as_tuple=True)
+        pos = torch.full((len(comes), self.slots, 3), torch.nan)
+        time = torch.full((len(comes), self.slots), torch.nan)
+        slot = self.slots - left[rows, number]
+        pos[rows, slot], time[rows, slot] = self._value[rows, number], self._time[rows, number].float()
+        came = comes.any(-1)
+        self._held[came] = pos[came, -1]
+        return Sensed(self._held.clone(), pos, time)
+
+    def _step_of(self, time: Tensor) -> Tensor:
+        """The control step with which what happens at ``time`` [s] is there, int64."""
+        return torch.ceil(time / self.control_step - ROUNDING).long()
+
+    def _measured(self, place: Tensor, error: Tensor) -> Tensor:
+        value, grain = place + error, self.sensor.quantisation
+        return torch.round(value / grain) * grain if grain else value

@@ -1,0 +1,55 @@
+"""What a camera does to the place of a target, in six numbers. Nothing heavy is imported here."""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+from dataclasses import dataclass
+
+LOWEST_RATE, HIGHEST_RATE = 1.0, 10_000.0
+"""Measurements a second that a sensor may take [Hz]."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Sensor:
+    """How an environment's target is measured; by default exactly, at every control step, at once.
+
+    Measurement n is taken about n / ``rate`` seconds after the reset, and is seen ``latency`` seconds later. The first
+    one is there at the reset, and never lost.
+    """
+
+    rate: float | None = None
+    """Measurements a second [Hz]; one at each control step for None."""
+    noise: float = 0.0
+    """Standard deviation of a measurement's error along each axis [m]."""
+    latency: float = 0.0
+    """Time from when a measurement is taken to when it is seen [s]."""
+    jitter: float = 0.0
+    """Standard deviation of the moment at which a measurement is taken about the regular one [s]."""
+    dropout: float = 0.0
+    """Share of the measurements that are lost."""
+    quantisation: float = 0.0
+    """Measurements are whole multiples of this along each axis [m]; 0 for any number."""
+
+    def __post_init__(self) -> None:
+        from torchdyn_plan.checks import check_number
+
+        if self.rate is not None:
+            check_number("rate", self.rate, minimum=LOWEST_RATE, maximum=HIGHEST_RATE)
+        for name in ("noise", "latency", "jitter", "quantisation"):
+            check_number(name, getattr(self, name), minimum=0.0, maximum=10.0)
+        check_number("dropout", self.dropout, minimum=0.0, maximum=1.0)
+
+    @property
+    def is_exact(self) -> bool:
+        """Whether it shows the truth at every control step."""
+        return self == type(self)()
+
+    def slots(self, control_step: float) -> int:
+        """Measurements that can come within a control step [s]; of more, as jitter may bring, the first are lost."""
+        regular = math.ceil(control_step * (self.rate or 1.0 / control_step) - 1e-9)
+        return max(regular, 1) + (3 if self.jitter else 0)
+
+    def told(self) -> dict[str, float | None]:
+        """Every number by name, for files."""
+        return dataclasses.asdict(self)

@@ -1,0 +1,162 @@
+"""A planner that sees its target through measurements: at any rate, late, noisy, with gaps."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any, Self
+
+import torch
+from tensordict import TensorDictBase
+from tensordict.nn import TensorDictModuleBase
+from torch import Tensor
+
+from torchdyn_plan import keys
+from torchdyn_plan.checks import check_number, check_trailing_shape
+from torchdyn_plan.errors import InputError
+from torchdyn_plan.planners.memory import Remembering, remember, warn_of_loss
+from torchdyn_plan.planners.plan import PlanStatus
+from torchdyn_plan.planners.pretrained import PretrainedPlanner
+from torchdyn_plan.planners.protocol import keys_written, read
+from torchdyn_plan.planners.rows import where_rows
+from torchdyn_plan.planners.track import Track, TrackState
+
+NAMES = tuple(f"track_{field}" for field in TrackState._fields)
+"""What it remembers below ``plan``."""
+AGE, DEVIATION = "track_age", "track_deviation"
+"""Written beside, for people to read: how old the newest measurement is [s], and how far the target may be from where
+it is taken to be: standard deviation along each axis [m]."""
+SHOWN = (keys.TARGET_POS, keys.TARGET_HISTORY, keys.TARGET_COVARIANCE)
+"""What the planner inside is shown in place of what the tensordict holds."""
+
+
+class TrackedPlanner(PretrainedPlanner, Remembering):
+    """Puts a `Track` between what is measured of the target and a planner, whose ``target_pos`` and history it writes.
+
+    Reads ``measured_pos`` (*B, M, 3) and ``measured_time`` (*B, M), up to M measurements that have come since the last
+    step; where they are absent, ``target_pos`` is one of now. The planner sees where the target is now by the track,
+    its past at each control step, and the covariance of the two; afterwards these entries are as they were. Rows
+    without a usable track are `PlanStatus.NO_TRACK`: they hold still until there is one. ``track_restarts`` and
+    ``track_rejected`` below ``plan`` count what did not fit.
+    """
+
+    def __init__(
+        self,
+        planner: Callable[[TensorDictBase], TensorDictBase],
+        track: Track,
+        *,
+        control_step: float,
+        history: int = 24,
+    ) -> None:
+        """Let ``planner`` see by ``track``.
+
+        Args:
+            planner: any planner for a moving target.
+            track: what becomes of the measurements.
+            control_step: time between two steps [s].
+            history: positions H of the target's history; as many as the planner's forecaster reads.
+        """
+        super().__init__()
+        check_number("control_step", control_step, minimum=1e-6)
+        check_number("history", history, minimum=2, integer=True)
+        if not isinstance(track, Track):
+            raise InputError(f"track must be a Track, as KalmanTrack(), got {type(track).__name__}")
+        if not isinstance(planner, TensorDictModuleBase):
+            raise InputError(f"planner must be a planner of this package, got {type(planner).__name__}")
+        self.planner, self.track, self.control_step, self.history = planner, track, control_step, history
+        own: list[Any] = [(keys.PLAN, name) for name in NAMES]
+        seen = [key for key in planner.in_keys if key not in SHOWN]
+        read_keys: list[Any] = list(dict.fromkeys([keys.TARGET_POS, keys.STEP_COUNT, *seen, *own]))
+        self.in_keys = read_keys
+        reported = [(keys.PLAN, name) for name in (AGE, DEVIATION)]
+        self.out_keys = keys_written(planner, *own, *reported)
+
+    @property
+    def scene(self) -> str | None:
+        """Digest of the planner's scene."""
+        return getattr(self.planner, "scene", None)
+
+    def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
+        """Take in what was measured, and let the planner act on it."""
+        like, step_count = read(tensordict, keys.TARGET_POS, "TrackedPlanner"), read(tensordict, keys.STEP_COUNT, "")
+        check_trailing_shape(keys.TARGET_POS, like, 3)
+        step_count = step_count.reshape(like.shape[:-1])
+        now = step_count.to(like.dtype) * self.control_step
+        state = self._measure(self._recall(tensordict, like, step_count), tensordict, like, now)
+        present, usable = self.track.at(state, now), self.track.usable(state, now)
+        original = {key: tensordict.get(key, None) for key in SHOWN}
+        for key, value in zip(SHOWN, self._shown(state, present, usable, now), strict=True):
+            tensordict.set(key, value)
+        tensordict = self.planner(tensordict)
+        for key, value in original.items():
+            _restore(tensordict, key, value)
+        self._report(tensordict, state, present, usable, now)
+        return tensordict
+
+    def empty_memory(self, like: Tensor) -> dict[str, Tensor]:
+        """The track's and the planner's, as `Remembering` says."""
+        inner = self.planner.empty_memory(like) if isinstance(self.planner, Remembering) else {}
+        return dict(zip(NAMES, self.track.start(like), strict=True)) | inner
+
+    def part_settings(self) -> dict[str, Any]:
+        """Arguments that make the same planner."""
+        names = ("planner", "track", "control_step", "history")
+        return {name: getattr(self, name) for name in names}
+
+    def with_planner(self, planner: Callable[[TensorDictBase], TensorDictBase]) -> Self:
+        """The same track before another planner."""
+        settings: dict[str, Any] = self.part_settings() | {"planner": planner}
+        return type(self)(**settings).train(self.training)
+
+    def for_inference(self) -> Self:
+        """The same on copies of the planner's networks as they are now, in as few operations as possible."""
+        fast = getattr(self.planner, "for_inference", None)
+        return self if fast is None else self.with_planner(fast())
+
+    def _recall(self, tensordict: TensorDictBase, like: Tensor, step_count: Tensor) -> TrackState:
+        """The state after the step before; rows at step 0, and those whose memory is no number, start afresh."""
+        start, plan = self.track.start(like), tensordict.get(keys.PLAN, None)
+        stored: dict[str, Any] = {} if plan is None else dict(plan.items())
+        if any(name not in stored for name in NAMES):
+            warn_of_loss(NAMES[0], step_count == 0)
+            return start
+        state = TrackState(*(stored[name] for name in NAMES))
+        fresh = (step_count == 0) | state.motion.isnan().any(-1) | state.time.isnan()
+        return TrackState(*(where_rows(fresh, new, old) for new, old in zip(start, state, strict=True)))
+
+    def _measure(self, state: TrackState, tensordict: TensorDictBase, target_pos: Tensor, now: Tensor) -> TrackState:
+        """The state after the measurements of this step."""
+        pos, time = tensordict.get(keys.MEASURED_POS, None), tensordict.get(keys.MEASURED_TIME, None)
+        if pos is None or time is None:
+            return self.track.add(state, now, target_pos, now)
+        check_trailing_shape(keys.MEASURED_POS, pos, *time.shape, 3)
+        for slot in range(time.shape[-1]):
+            state = self.track.add(state, time[..., slot], pos[..., slot, :], now)
+        return state
+
+    def _shown(self, state: TrackState, present: TrackState, usable: Tensor, now: Tensor) -> tuple[Tensor, ...]:
+        """What the planner sees, as in `SHOWN`; no numbers in rows without a usable track."""
+        ago = self.control_step * torch.arange(1 - self.history, 1, dtype=now.dtype, device=now.device)
+        history = where_rows(
+            usable, state.path(now.unsqueeze(-1) + ago), torch.full_like(now, torch.nan)[..., None, None]
+        )
+        covariance = where_rows(usable, present.covariance, torch.zeros_like(now)[..., None, None])
+        return history[..., -1, :], history, covariance
+
+    def _report(
+        self, tensordict: TensorDictBase, state: TrackState, present: TrackState, usable: Tensor, now: Tensor
+    ) -> None:
+        deviation = present.covariance[..., 0, 0].sqrt()
+        entries = dict(zip(NAMES, state, strict=True)) | {AGE: now - state.time, DEVIATION: deviation}
+        plan = tensordict.get(keys.PLAN, None)
+        status = None if plan is None else plan.get("status", None)
+        if status is not None:
+            entries["status"] = status.masked_fill(~usable, int(PlanStatus.NO_TRACK))
+        remember(tensordict, entries)
+
+
+def _restore(tensordict: TensorDictBase, key: str, value: Tensor | None) -> None:
+    """Put ``value`` back, or take the entry ``key`` away that was not there."""
+    if value is not None:
+        tensordict.set(key, value)
+    elif key in tensordict.keys():  # noqa: SIM118
+        tensordict.pop(key)
