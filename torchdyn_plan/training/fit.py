@@ -44,6 +44,11 @@ def task_fitting(task: Task) -> Fitting:
     return task.fitting()
 
 
+def words_of(task: Task) -> str:
+    """What the command line calls ``task``, with its scene if that is not the one that its name alone stands for."""
+    return task.name if task.scene == next(iter(task.scenes), "") else f"{task.name} --scene {task.scene}"
+
+
 def fit_forecaster(
     task: Task,
     data: Path,
@@ -83,7 +88,7 @@ def fit_forecaster(
     folder = out / Forecaster.kind
     optimise(network, loss, lambda: _forecast_figures(score()), recipe, out=folder, settings=settings, resume=resume)
     counts = {"episodes": episodes, "held out": len(samples.held)}
-    return write_network(network, folder, score, task=task.name, recipe=recipe, facts=about | counts)
+    return write_network(network, folder, score, task=words_of(task), recipe=recipe, facts=about | counts)
 
 
 def line_loss(network: Forecaster, windows: Windows) -> Tensor:
@@ -159,7 +164,7 @@ def fit_eta(
     folder = out / name
     optimise(network, loss, lambda: _arrival_figures(score()), recipe, out=folder, settings=settings, resume=resume)
     facts = about | {"samples": len(samples.run), "held out": len(held.run)}
-    return write_network(network, folder, score, task=task.name, recipe=recipe, facts=facts, network_name=name)
+    return write_network(network, folder, score, task=words_of(task), recipe=recipe, facts=facts, network_name=name)
 
 
 def _in_parts(forward: Callable[[slice], Tensor], count: int) -> Tensor:

@@ -15,7 +15,7 @@ from torchdyn_plan.nets.forecaster import Forecaster
 from torchdyn_plan.nets.spread import Spread, SpreadConfig, SpreadNetwork
 from torchdyn_plan.tasks.task import Task
 from torchdyn_plan.training.card import Rows, Tables, write_network
-from torchdyn_plan.training.fit import task_fitting
+from torchdyn_plan.training.fit import task_fitting, words_of
 from torchdyn_plan.training.fitting import Fitting
 from torchdyn_plan.training.metrics import coverage, lost_probability
 from torchdyn_plan.training.optimise import Recipe, optimise
@@ -73,7 +73,7 @@ def fit_spread(
     folder = out / SpreadNetwork.kind
     optimise(network, loss, validate, recipe, out=folder, settings=settings, resume=resume)
     counts = {"episodes": episodes, "held out": len(samples.held), "forecaster": forecaster}
-    return write_network(network, folder, score, task=task.name, recipe=recipe, facts=about | counts)
+    return write_network(network, folder, score, task=words_of(task), recipe=recipe, facts=about | counts)
 
 
 def spread_loss(forecaster: Forecaster, network: SpreadNetwork, windows: Windows) -> Tensor:
