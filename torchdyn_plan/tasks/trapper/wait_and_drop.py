@@ -172,6 +172,8 @@ class WaitAndDrop:
     """A box is down below this share of the target's height."""
     missed_by: float = 0.01
     """A target this far outside of the box's inner walls was missed [m]."""
+    drop_margin: float = 0.005
+    """A ball this far beyond the room that the box leaves it is in the box all the same: walls give [m]."""
     min_drop_steps: int = 8
     """For so many control steps a drop is not given up: the box is on its way down."""
     max_drop_steps: int = 40
@@ -183,7 +185,7 @@ class WaitAndDrop:
         check_number("aim_ahead_steps", self.aim_ahead_steps, minimum=0, maximum=self.lookahead - 1, integer=True)
         for name in ("follow_after", "min_drop_steps", "max_drop_steps"):
             check_number(name, getattr(self, name), minimum=0, integer=True)
-        for name in ("drop_height", "pull", "half_extent", "begin_above", "down_below", "missed_by"):
+        for name in ("drop_height", "pull", "half_extent", "begin_above", "down_below", "missed_by", "drop_margin"):
             check_number(name, getattr(self, name), minimum=0.0)
 
     @classmethod
@@ -223,7 +225,7 @@ class WaitAndDrop:
         goal = plan.goal
         if torch.compiler.is_compiling() or debug_unwrap(drop_step >= 0).any():
             drop_step = drop_step.masked_fill(self._has_missed(drop_step, observation), -1)
-            goal = torch.where((drop_step >= 0).unsqueeze(-1), self._goal(drop_step, path, tool_pos), goal)
+            goal = torch.where((drop_step >= 0).unsqueeze(-1), self._goal(drop_step, path, observation), goal)
         return goal, DropState(drop_step, tool_pos)
 
     def _has_missed(self, drop_step: Tensor, observation: Observation) -> Tensor:
@@ -233,10 +235,14 @@ class WaitAndDrop:
         over = (drop_step > self.min_drop_steps) & (down | (drop_step > self.max_drop_steps))
         return over & (offset > self.drop.half_width + self.missed_by)
 
-    def _goal(self, drop_step: Tensor, path: Tensor, tool_pos: Tensor) -> Tensor:
+    def _goal(self, drop_step: Tensor, path: Tensor, observation: Observation) -> Tensor:
         """Goal ``(*B, 3)`` [m, world] of a box that drops."""
-        level = tool_pos[..., :2]
-        follow = (drop_step >= self.follow_after).unsqueeze(-1)
+        tool_pos = observation.tool_pos
+        level, away = tool_pos[..., :2], (observation.target_pos - tool_pos)[..., :2].abs().amax(-1)
+        # The forecast knows of no box, and goes on through its wall: a box that followed it would let the ball out.
+        room = self.drop.half_width - self.drop.radius + self.drop_margin
+        caught = (tool_pos[..., 2] < self.drop.radius) & (away <= room)
+        follow = ((drop_step >= self.follow_after) & ~caught).unsqueeze(-1)
         down = torch.where(follow, pulled(level, path[..., self.aim_ahead_steps, :2], self.pull), level)
         down = down.clamp(-self.half_extent, self.half_extent)
         return torch.cat([down, torch.full_like(down[..., :1], self.drop_height)], dim=-1)
