@@ -13,6 +13,7 @@ from gymnasium.utils.env_checker import check_env  # noqa: E402
 from torchrl.envs import GymEnv  # noqa: E402
 
 import torchdyn_plan.gym  # noqa: E402
+from tests.scripts import run  # noqa: E402
 from torchdyn_plan.errors import InputError  # noqa: E402
 
 NAMES = sorted(torchdyn_plan.gym.FORMS)
@@ -144,8 +145,8 @@ def test_success_is_told():
 
 def test_a_name_alone_is_enough():
     code = "import gymnasium; print(gymnasium.make('torchdyn_plan.gym:torchdyn_plan/TrapperStaticFlat-v0').spec.id)"
-    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
-    assert done.stdout.strip() == "torchdyn_plan/TrapperStaticFlat-v0"
+    ran = run(code, cwd=".")
+    assert ran.stdout.strip() == "torchdyn_plan/TrapperStaticFlat-v0", ran.stderr
 
 
 def test_bad_input_is_refused():

@@ -102,11 +102,14 @@ LOOPS = {
 }
 
 
-@pytest.mark.parametrize("parts", PARTS.values(), ids=PARTS.keys())
-@pytest.mark.parametrize("loop", LOOPS.values(), ids=LOOPS.keys())
+# What workers are made by has to do with no part of a planner: one that remembers most is enough.
+CASES = [(loop, parts) for loop in LOOPS for parts in PARTS if loop != "EnvCreator" or parts == "late"]
+
+
+@pytest.mark.parametrize(("loop", "parts"), CASES)
 def test_plans_and_actions_are_those_of_the_plain_loop(loop, parts, tmp_path):
-    expected = by_hand(make_planner(**parts))
-    found = loop(make_planner(**parts), tmp_path)
+    expected = by_hand(make_planner(**PARTS[parts]))
+    found = LOOPS[loop](make_planner(**PARTS[parts]), tmp_path)
     assert_same(found, expected)
     assert bool((expected["plan", "replans"].amax(-1) >= 2).all())
 

@@ -10,7 +10,7 @@ from torchrl.envs.utils import check_env_specs
 from tests.planners.toy import NO_MEMORY, ToyEnv, assert_same, make_planner, observation
 from torchdyn_plan.envs import TrapperEnv
 from torchdyn_plan.nets import Actor
-from torchdyn_plan.planners import Delayed, EventSchedule, PlanStatus, PolicyPlanner, ReplanSchedule, TargetPursuit
+from torchdyn_plan.planners import Delayed, EventSchedule, PlanStatus, PolicyPlanner, TargetPursuit
 from torchdyn_plan.planners.memory import REPORTED
 from torchdyn_plan.tasks import load_task
 from torchdyn_plan.tasks.trapper.task import ik_planner
@@ -237,15 +237,3 @@ def test_the_memory_of_a_static_planner_is_declared_too():
         for name, value in empty.items():
             assert (value.shape, value.dtype) == (td["plan", name].shape, td["plan", name].dtype), name
         check_env_specs(primed(TrapperEnv(2, seed=0, num_threads=1), planner))
-
-
-def test_a_compiled_planner_remembers():
-    parts = {"schedule": ReplanSchedule.every(3, first_step=1), "delivery": Delayed(2)}
-    env, planner = ToyEnv(3), make_planner(**parts)
-    torch._dynamo.reset()
-    compiled = torch.compile(make_planner(**parts), backend="eager")
-    td = planner(env.reset())
-    for _ in range(9):
-        td = env.step_mdp(env.step(td))
-        assert_same(compiled(td.clone()), planner(td))
-    assert bool((td["plan", "replans"] >= 2).all())

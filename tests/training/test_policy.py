@@ -4,8 +4,6 @@ import csv
 import json
 import os
 import signal
-import subprocess
-import sys
 import time
 from dataclasses import replace
 from pathlib import Path
@@ -15,6 +13,7 @@ import torch
 from safetensors import safe_open
 from safetensors.torch import load_file, save_file
 
+from tests.scripts import CONTEXT
 from tests.training.points import PointTask
 from torchdyn_plan.errors import InputError, TrainingError
 from torchdyn_plan.nets.policy import Actor
@@ -88,26 +87,25 @@ def test_interrupted_training_ends_where_an_undisturbed_one_does(algorithm: str,
     assert all(torch.equal(value, other[name]) for name, value in one.items())
 
 
+def train(folder: Path, recipe: DDPGRecipe) -> None:
+    torch.set_num_threads(1)
+    fit_policy(PointTask(), folder, recipe=recipe, score_every=2)
+
+
 @pytest.mark.parametrize("algorithm", ALGORITHMS)
 def test_killed_training_resumes(algorithm: str, tmp_path: Path) -> None:
     """A real process, killed with SIGKILL when it has written a checkpoint, leaves a folder that goes on exactly."""
-    fit_policy(PointTask(), tmp_path / "whole", recipe=RECIPES[algorithm], score_every=2)
-    code = (
-        "from pathlib import Path; import sys; sys.path.insert(0, sys.argv[2])\n"
-        "from tests.training.points import PointTask; from tests.training.test_policy import RECIPES\n"
-        "from torchdyn_plan.training.policy import fit_policy\n"
-        "fit_policy(PointTask(), Path(sys.argv[1]), recipe=RECIPES[sys.argv[3]], score_every=2)"
-    )
-    words = [sys.executable, "-c", code, str(tmp_path / "killed"), str(Path(__file__).parents[2]), algorithm]
-    process = subprocess.Popen(words, stderr=subprocess.DEVNULL)
+    train(tmp_path / "whole", RECIPES[algorithm])
+    process = CONTEXT.Process(target=train, args=(tmp_path / "killed", RECIPES[algorithm]))
+    process.start()
     checkpoint = tmp_path / "killed" / "policy" / "checkpoint.safetensors"
     deadline = time.monotonic() + 120
-    while not checkpoint.exists() and process.poll() is None and time.monotonic() < deadline:
+    while not checkpoint.exists() and process.is_alive() and time.monotonic() < deadline:
         time.sleep(0.01)
-    os.kill(process.pid, signal.SIGKILL)
-    process.wait()
+    process.kill()
+    process.join()
     assert checkpoint.exists()
-    fit_policy(PointTask(), tmp_path / "killed", recipe=RECIPES[algorithm], score_every=2)
+    train(tmp_path / "killed", RECIPES[algorithm])
     whole, killed = weights(tmp_path / "whole"), weights(tmp_path / "killed")
     assert all(torch.equal(value, killed[name]) for name, value in whole.items())
 

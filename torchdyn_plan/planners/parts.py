@@ -87,6 +87,7 @@ class ComposedPlanner(PretrainedPlanner, Remembering):
         if shared:
             raise InputError(f"the static planner and the planner both remember {', '.join(shared)}")
         self.out_keys = keys_written(self.static, keys.GOAL, keys.ARRIVAL_STEPS, *remembered, *reported)
+        self.read_besides = [key for key in self.in_keys if key not in (*SEEN_BY_ALL, *self.forecaster.in_keys)]
         self.read_by_static = [key for key in keys_read(self.static) if key not in SEEN_BY_ALL]
 
     def with_parts(self, **parts: Any) -> Self:

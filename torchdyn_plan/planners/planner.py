@@ -39,7 +39,7 @@ class DynamicPlanner(ComposedPlanner):
         """Plan where a plan is due, and act; raises `InputError` for a missing key or a wrong shape."""
         seen = observe(tensordict, self.forecaster)
         obs, found = seen, GOOD
-        if not are_sane(tensordict, self.in_keys):
+        if not are_sane(tensordict, self.read_besides, *seen[:3], *seen.seen):
             obs, found = judge(seen, tensordict, self.read_by_static, self.memory.names)
         # Not the clean one: a row that begins without being seen must not remember zeros for its place.
         clock, plan, state, pending = self.memory.recall(tensordict, seen, found.spoiled)
@@ -117,8 +117,8 @@ def observe(tensordict: TensorDictBase, forecaster: ForecastModel) -> Observatio
     return Observation(tool_pos, target_pos, robot_state, step_count, tuple(seen))
 
 
-def are_sane(tensordict: TensorDictBase, read: Sequence[Any]) -> bool:
-    """Whether all entries ``read`` that are there can be looked at, and hold what measurements can be: numbers.
+def are_sane(tensordict: TensorDictBase, read: Sequence[Any], *known: Tensor) -> bool:
+    """Whether what is ``known`` and all entries ``read`` that are there can be looked at, and are numbers of some size.
 
     One quick look passes nearly always; `judge` says row by row what is wrong.
     """
@@ -126,7 +126,7 @@ def are_sane(tensordict: TensorDictBase, read: Sequence[Any]) -> bool:
     # A plain dictionary: a nested look-up takes as long as a small operation.
     stored = {} if plan is None else dict(plan.items())
     found = [tensordict.get(key, None) if isinstance(key, str) else stored.get(key[-1]) for key in read]
-    values = [value for value in found if value is not None]
+    values = [*known, *(value for value in found if value is not None)]
     if torch.compiler.is_compiling() or any(debug_unwrap(value) is not value for value in values):
         return False
     flat = torch.cat([value.reshape(-1) for value in values if value.is_floating_point()])
