@@ -52,7 +52,7 @@ def run(env: TrapperEnv, planner: DynamicPlanner, episode: int) -> tuple[bool, l
         state = step_mdp(state)
 
 
-def main(file: str, before: int = 160) -> None:
+def main(file: str, before: int = 200) -> None:
     """Draw the first trap that comes after a bounce and a long way, ``before`` steps before it."""
     env, planner = TrapperEnv(1, velocity=3.0, split="dev", seed=0), DynamicPlanner.from_pretrained("trapper-ik")
     for episode in range(100):

@@ -43,6 +43,7 @@ ELSEWHERE = {
     "descriptions",
     "measure_arrivals",
     "nearest",
+    "paper_scene",
     "policy_curves",
     "policy_peers",
     "same_episodes",

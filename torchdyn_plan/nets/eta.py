@@ -113,7 +113,7 @@ class ETANetwork(Pretrained, Precise, ArrivalModel):
             state, target = state.to(stored), target.to(stored)
         hidden = (self.state_in(state) + self.goal_in(target)).relu_()
         rows = self.third(self.second(hidden.view(-1, self.config.hidden)).relu_()).relu_()
-        scores = self.head(rows).view(*hidden.shape[:-1], -1)
+        scores = self.head(rows).view(*hidden.shape[:-1], self.config.bins + self.config.never)
         scores = scores if self.config.never else without_never(scores)
         return scores if scores.dtype == goal.dtype else scores.to(goal.dtype)
 

@@ -330,7 +330,8 @@ class InferenceETA(Precise, ArrivalModel):
         hidden = (torch.cat([goal.expand(offset.shape), lengths], dim=-1) @ self.goal_weight).add_(state).relu_()
         rows = torch.addmm(self.second_bias, hidden.view(-1, self.config.hidden), self.second_weight).relu_()
         rows = torch.addmm(self.third_bias, rows, self.third_weight).relu_()
-        rows = torch.addmm(self.head_bias, rows, self.head_weight).view(*hidden.shape[:-1], -1)
+        rows = torch.addmm(self.head_bias, rows, self.head_weight)
+        rows = rows.view(*hidden.shape[:-1], self.config.bins + self.config.never)
         return rows if self.config.never else without_never(rows)
 
 

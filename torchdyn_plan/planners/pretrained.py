@@ -50,6 +50,10 @@ class HasSettings(Protocol):
 class PretrainedPlanner:
     """Adds `save_pretrained` and `from_pretrained` to a planner that is made of parts."""
 
+    def prepare(self) -> Self:
+        """Get ready to run once all parts are loaded and frozen; by default nothing is to be done. Returns itself."""
+        return self
+
     def save_pretrained(self, folder: str | Path) -> Path:
         """Write the planner into ``folder``: ``planner.json``, a ``.safetensors`` for each network, and a card.
 
