@@ -31,8 +31,7 @@ class DynamicPlanner(ComposedPlanner):
     Writes ``goal`` (*B, 3) [m, world], ``arrival_steps`` (*B,), what the static planner writes, and under ``plan`` the
     memory for the next step and each row's `PlanStatus`. A row plans when its schedule says so, and starts afresh at
     ``step_count`` 0. One that cannot plan, as its input or forecast is no number or its target is lost, holds its tool
-    still and tries again at every step; one whose robot is not seen gets action 0; other rows do not notice. Its parts
-    are those of `ComposedPlanner`.
+    still and tries again at every step; one whose robot is not seen gets action 0. Parts: see `ComposedPlanner`.
     """
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
@@ -46,7 +45,6 @@ class DynamicPlanner(ComposedPlanner):
         busy = None
         if self.delivery is not None:
             plan, busy = self.delivery.arrive(plan, pending, obs)
-
         late = partial(lateness, self.eta, obs, plan, self.chunk)
         ticked, due = self.schedule.tick(clock, obs, plan, busy=busy, late=late)
         trouble = input_status(obs, found.bad_input, self.lost)
@@ -62,10 +60,8 @@ class DynamicPlanner(ComposedPlanner):
             if torch.compiler.is_compiling() or debug_unwrap(due & ~planned).any():
                 ticked = ticked.retry(due & ~planned, clock)
             holds = (due & ~able) | ~plan.usable
-
         plan = plan.held(holds, obs.tool_pos)
         goal, state = self.maneuver(plan, obs, holds, state)
-
         status = plan.status(trouble, ticked.replans)
         self.memory.remember(tensordict, (ticked, plan, state, pending), replanned=planned, status=status)
         tensordict.set(keys.GOAL, goal)
