@@ -524,3 +524,18 @@ def test_what_cannot_be_saved_is_told_at_least(tmp_path, monkeypatch, capsys):
     assert err.splitlines()[-1].startswith("torchdyn-plan: error: cannot write ")
     assert err.splitlines()[-1].endswith("episodes.json': No space left on device")
     assert not (tmp_path / "new").exists()
+
+
+def test_a_scene_is_named_beside_its_task(capsys):
+    with pytest.raises(SystemExit):
+        cli.main(["evaluate", "--help"])
+    assert "--scene" in capsys.readouterr().out
+    for words, message in (
+        (["evaluate", "--scene", "papr"], "unknown scene of trapper 'papr' (did you mean 'paper'?)"),
+        (["evaluate", "--task", "fetch_reach", "--scene", "paper"], "fetch_reach has one scene alone, got 'paper'"),
+        (["evaluate", "--scene"], "--scene names none"),
+    ):
+        with pytest.raises(SystemExit) as stopped:
+            cli.main(words)
+        assert stopped.value.code == 2
+        assert message in capsys.readouterr().err

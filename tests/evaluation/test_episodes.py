@@ -10,7 +10,7 @@ from torchdyn_plan import keys
 from torchdyn_plan.envs import TrapperEnv, TrapperScene
 from torchdyn_plan.envs.trapper.contact import is_pocketed
 from torchdyn_plan.envs.trapper.starts import draw_starts
-from torchdyn_plan.evaluation.episodes import find_truth, run_episodes
+from torchdyn_plan.evaluation.episodes import ShownTruth, find_truth, run_episodes
 from torchdyn_plan.planners import (
     CallablePlanner,
     CornerSearch,
@@ -211,3 +211,26 @@ def test_a_ball_that_leaves_its_recorded_path_was_touched_or_trapped(truth):
     assert torch.equal(outcome.steps > 0, outcome.success)
     lengths = torch.tensor([len(path) for path in paths])
     assert torch.equal(outcome.steps[outcome.success], lengths[outcome.success])
+
+
+def test_the_truth_stays_true_when_a_ball_is_touched(truth):
+    env = TrapperEnv(2, velocity=3.0, seed=0, split="dev", num_threads=1)
+    planner = Watched(StillPursuit(), [keys.TRUE_FUTURE])
+    shown, td = ShownTruth(planner, env, truth.future), env.reset()
+    still = torch.zeros(2, 6)
+    for _ in range(20):
+        td = env.step_mdp(env.step(td.set("action", still)))
+    shown.show(td)
+    torch.testing.assert_close(td[keys.TRUE_FUTURE][:, 0], truth.future[td["episode"], 21], atol=1e-3, rtol=0)
+    # Somebody kicks the first ball; the other one is left alone.
+    env.simulation.ball_vel[0, :2] *= -0.5
+    for _ in range(10):
+        td = env.step_mdp(env.step(td.set("action", still)))
+    shown.show(td)
+    future = td[keys.TRUE_FUTURE].clone()
+    for ahead in range(60):
+        td = env.step_mdp(env.step(td.set("action", still)))
+        torch.testing.assert_close(future[:, ahead], td["target_pos"], atol=2e-3, rtol=0)
+    recorded = truth.future[td["episode"], 90]
+    assert (td["target_pos"] - recorded)[0].norm() > 0.1, "the recording is no longer true"
+    assert (td["target_pos"] - recorded)[1].norm() < 2e-3

@@ -7,7 +7,9 @@ from tests.tasks.trapper.crossing import make_planner, world
 from torchdyn_plan.envs import TrapperScene
 from torchdyn_plan.errors import InputError
 from torchdyn_plan.planners.observation import Observation
+from torchdyn_plan.planners.plan import Plan
 from torchdyn_plan.tasks.trapper.keep import GoToAndKeep
+from torchdyn_plan.tasks.trapper.wait_and_drop import DropState, WaitAndDrop
 
 SCENE = TrapperScene()
 KEEP = GoToAndKeep.of(SCENE)
@@ -53,5 +55,18 @@ def test_a_planner_with_it_stays_where_its_plan_is_long_over():
 
 
 def test_sizes_that_cannot_be_are_refused():
-    with pytest.raises(InputError, match="half_room must be >= 0, got -1"):
-        GoToAndKeep(down_below=0.04, half_room=-1.0)
+    with pytest.raises(InputError, match="half_width must be >= 0, got -1"):
+        GoToAndKeep(radius=0.04, half_width=-1.0)
+
+
+def test_a_dropping_box_follows_the_forecast_only_until_it_has_caught_the_ball():
+    # The ball rests in the box, while the forecast that knows of no box has it go on through the wall.
+    maneuver = WaitAndDrop.of(SCENE)
+    tool = torch.tensor([[0.0, 0.0, LOW], [0.0, 0.0, LOW]])
+    ball = torch.tensor([[0.02, 0.0, 0.042], [0.05, 0.0, 0.042]])
+    path = ball.unsqueeze(1) + 0.004 * torch.arange(60.0)[:, None] * torch.tensor([1.0, 0.0, 0.0])
+    seen = Observation(tool_pos=tool, target_pos=ball, robot_state=tool, step_count=torch.full((2,), 50), seen=())
+    plan = Plan.hold(seen, length=path.shape[1])._replace(path=path, age=torch.zeros(2, dtype=torch.int64))
+    goal = maneuver(plan, seen, torch.zeros(2, dtype=torch.bool), DropState(torch.full((2,), 9), tool))[0]
+    torch.testing.assert_close(goal[0, :2], tool[0, :2])
+    assert goal[1, 0] > 0.03, "one that is still outside is followed"

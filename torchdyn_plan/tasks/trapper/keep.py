@@ -12,10 +12,25 @@ from torchdyn_plan.checks import check_number
 from torchdyn_plan.planners.maneuver import GoTo, NoState
 from torchdyn_plan.planners.observation import Observation
 from torchdyn_plan.planners.plan import Plan
-from torchdyn_plan.tasks.trapper.approach import metres
 
 if TYPE_CHECKING:
     from torchdyn_plan.envs.trapper.scene import TrapperScene
+
+GIVE = 0.005
+"""How far beyond the room that the box leaves it a ball may be and still be in the box: walls give [m]."""
+
+
+def is_caught(tool_pos: Tensor, target_pos: Tensor, *, radius: float, half_width: float) -> Tensor:
+    """Whether a box is down over the ball, as a planner sees it: ``(*B,)`` bool.
+
+    Args:
+        tool_pos: ``(*B, 3)`` centre of the box mouth [m, world].
+        target_pos: ``(*B, 3)`` centre of the ball [m, world].
+        radius: of the ball: a box whose rim is lower than that is down [m].
+        half_width: inner, of the box [m].
+    """
+    away = (target_pos - tool_pos)[..., :2].abs().amax(-1)
+    return (away <= half_width - radius + GIVE) & (tool_pos[..., 2] < radius) & (target_pos[..., 2] > 0.0)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -26,24 +41,23 @@ class GoToAndKeep(GoTo):
     would let out the ball that it has.
     """
 
-    down_below: float
-    """A box whose rim is below this height is down [m]."""
-    half_room: float
-    """The ball's centre is at most this far from the box's middle along each axis while the box holds it [m]."""
+    radius: float
+    """Radius of the ball [m]."""
+    half_width: float
+    """Inner half-width of the box [m]."""
 
     def __post_init__(self) -> None:
-        for name in ("down_below", "half_room"):
+        for name in ("radius", "half_width"):
             check_number(name, getattr(self, name), minimum=0.0)
 
     @classmethod
     def of(cls, scene: TrapperScene) -> Self:
         """The maneuver with the box and the ball of ``scene``."""
-        return cls(down_below=scene.ball_radius, half_room=metres(scene.box_half_width - scene.ball_radius + 0.005))
+        return cls(radius=scene.ball_radius, half_width=scene.box_half_width)
 
     def __call__(self, plan: Plan, observation: Observation, holds: Tensor, state: NoState) -> tuple[Tensor, NoState]:
         """The plan's goal, or the place where the box is."""
         tool_pos, target_pos = observation.tool_pos, observation.target_pos
-        away = (target_pos - tool_pos)[..., :2].abs().amax(-1)
-        kept = (away <= self.half_room) & (tool_pos[..., 2] < self.down_below) & (target_pos[..., 2] > 0.0)
+        caught = is_caught(tool_pos, target_pos, radius=self.radius, half_width=self.half_width)
         here = torch.cat([tool_pos[..., :2], target_pos[..., 2:]], dim=-1)
-        return torch.where(kept.unsqueeze(-1), here, plan.goal), state
+        return torch.where(caught.unsqueeze(-1), here, plan.goal), state

@@ -12,12 +12,11 @@ from torchdyn_plan.checks import check_trailing_shape
 from torchdyn_plan.envs.trapper.arm_runner import TrapperArmRunner
 from torchdyn_plan.envs.trapper.scene import TrapperScene, trapper_scene
 from torchdyn_plan.nets.arrival import Arrival, ArrivalModel
+from torchdyn_plan.tasks.trapper.data import run_plan
 from torchdyn_plan.training.runs import first_as_near
 
 LONGEST = 300
 """Control steps after which an arm that has not arrived never does."""
-AT_REST, STARTING = 0.05, 15
-"""An arm whose joints are slower than this, after so many control steps, comes no nearer [rad/s]."""
 
 
 class MeasuredArrival(ArrivalModel):
@@ -57,12 +56,15 @@ class MeasuredArrival(ArrivalModel):
             self._arms[count] = driven
         arms = self._arms[count]
         arms.reset(state[:, :6], state[:, 6:12])
+        plan = run_plan(self.scene)
+        assert plan.at_rest is not None
         arrived, tools = torch.full((count,), LONGEST + 1), []
         for step in range(LONGEST + 1):
             arrived = torch.where((arrived > LONGEST) & arms.is_reached(goal), step, arrived)
             tools.append(arms.tool_pos)
-            resting = (arms.robot_state[:, 6:12].abs() < AT_REST).all(-1) & (step > STARTING)
-            if bool(((arrived <= LONGEST) | (resting & self.nearest)).all()):
+            # At rest elsewhere it comes no nearer.
+            resting = plan.at_rest(arms.robot_state) & self.nearest & (step > plan.starting)
+            if bool(((arrived <= LONGEST) | resting).all()):
                 break
             arms.step(goal)
         if not self.nearest:

@@ -14,6 +14,7 @@ from torchdyn_plan.planners.observation import Observation
 from torchdyn_plan.planners.plan import Plan
 from torchdyn_plan.planners.search.exact import ExactSearch
 from torchdyn_plan.tasks.trapper.approach import BoxApproach, metres
+from torchdyn_plan.tasks.trapper.keep import is_caught
 
 if TYPE_CHECKING:
     from torchdyn_plan.envs.trapper.scene import TrapperScene
@@ -149,8 +150,8 @@ class WaitAndDrop:
     """A maneuver: wait above the meeting place, drop when the box will enclose the target, lift if it was missed.
 
     `Drop` says at every step, on the newest forecast, whether to begin now. The box first goes straight down, then
-    follows the target. The static planner hears of all that through the goal alone. Rows that cannot plan hold still
-    and begin no drop on what they knew before; one that has begun goes on.
+    follows the target until it has caught it. The static planner hears of all that through the goal alone. Rows that
+    cannot plan hold still and begin no drop on what they knew before; one that has begun goes on.
     """
 
     drop: Drop
@@ -172,8 +173,6 @@ class WaitAndDrop:
     """A box is down below this share of the target's height."""
     missed_by: float = 0.01
     """A target this far outside of the box's inner walls was missed [m]."""
-    drop_margin: float = 0.005
-    """A ball this far beyond the room that the box leaves it is in the box all the same: walls give [m]."""
     min_drop_steps: int = 8
     """For so many control steps a drop is not given up: the box is on its way down."""
     max_drop_steps: int = 40
@@ -185,7 +184,7 @@ class WaitAndDrop:
         check_number("aim_ahead_steps", self.aim_ahead_steps, minimum=0, maximum=self.lookahead - 1, integer=True)
         for name in ("follow_after", "min_drop_steps", "max_drop_steps"):
             check_number(name, getattr(self, name), minimum=0, integer=True)
-        for name in ("drop_height", "pull", "half_extent", "begin_above", "down_below", "missed_by", "drop_margin"):
+        for name in ("drop_height", "pull", "half_extent", "begin_above", "down_below", "missed_by"):
             check_number(name, getattr(self, name), minimum=0.0)
 
     @classmethod
@@ -237,11 +236,10 @@ class WaitAndDrop:
 
     def _goal(self, drop_step: Tensor, path: Tensor, observation: Observation) -> Tensor:
         """Goal ``(*B, 3)`` [m, world] of a box that drops."""
-        tool_pos = observation.tool_pos
-        level, away = tool_pos[..., :2], (observation.target_pos - tool_pos)[..., :2].abs().amax(-1)
+        tool_pos, target_pos = observation.tool_pos, observation.target_pos
+        level = tool_pos[..., :2]
         # The forecast knows of no box, and goes on through its wall: a box that followed it would let the ball out.
-        room = self.drop.half_width - self.drop.radius + self.drop_margin
-        caught = (tool_pos[..., 2] < self.drop.radius) & (away <= room)
+        caught = is_caught(tool_pos, target_pos, radius=self.drop.radius, half_width=self.drop.half_width)
         follow = ((drop_step >= self.follow_after) & ~caught).unsqueeze(-1)
         down = torch.where(follow, pulled(level, path[..., self.aim_ahead_steps, :2], self.pull), level)
         down = down.clamp(-self.half_extent, self.half_extent)
