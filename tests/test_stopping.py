@@ -9,6 +9,14 @@ from torchdyn_plan.progress import Lines, progress_bar
 from torchdyn_plan.stopping import Terminated, stop_when_safe, terminable
 
 
+@pytest.fixture(autouse=True)
+def interruptible():
+    """Ctrl-C as on a terminal: whoever runs the tests in the background has it ignored."""
+    former = signal.signal(signal.SIGINT, signal.default_int_handler)
+    yield
+    signal.signal(signal.SIGINT, former)
+
+
 @pytest.mark.parametrize(("number", "error"), [(signal.SIGINT, KeyboardInterrupt), (signal.SIGTERM, Terminated)])
 def test_a_signal_waits_until_it_is_safe(number, error):
     done = []

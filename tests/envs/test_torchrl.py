@@ -198,11 +198,12 @@ def test_a_collector_of_workers_goes_on_where_its_state_was_saved(make):
     steps = iter(first)
     for _ in range(3):
         next(steps)
-    state, expected = first.state_dict(), next(steps)["episode"].unique()
+    # Later in the batch an episode may end early, and which does is up to the policy.
+    state, expected = first.state_dict(), next(steps)["episode"][..., 0]
     second = build()
     second.load_state_dict(state)
     second.reset()
-    assert torch.equal(next(iter(second))["episode"].unique(), expected)
+    assert torch.equal(next(iter(second))["episode"][..., 0], expected)
     first.shutdown()
     second.shutdown()
 
