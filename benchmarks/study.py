@@ -64,7 +64,7 @@ class Study:
     def __init__(self, arguments: Output, *, scene: str | None = None, resume: bool = True) -> None:
         """Continue with the rows in the file of ``arguments``, if there is one.
 
-        Exits where the file holds rows of another scene.
+        Exits where the file holds rows of another scene, or of another version of this package.
 
         Args:
             arguments: of the study.
@@ -78,6 +78,9 @@ class Study:
             content = json.loads(file.read_text())
             if content.get("scene") != scene:
                 raise SystemExit(f"{file} holds rows of the scene {content.get('scene')}, not of {scene}")
+            made, here = content["versions"].get("torchdyn-plan"), library_versions()["torchdyn-plan"]
+            if made != here:
+                raise SystemExit(f"{file} holds rows of version {made}, not of {here}: give another file")
             self.rows = content["rows"]
 
     def row(self, about: Row, measure: Callable[[], Row]) -> Row:

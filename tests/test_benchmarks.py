@@ -151,6 +151,10 @@ def test_a_killed_study_goes_on_with_the_rows_in_its_file(study, tmp_path):
     with pytest.raises(SystemExit, match="holds rows of the scene here, not of there"):
         study.Study(arguments, scene="there")
     assert study.Study(arguments, scene="there", resume=False).rows == []
+    former = content | {"versions": content["versions"] | {"torchdyn-plan": "0.0.9"}}
+    arguments.out.write_text(json.dumps(former))
+    with pytest.raises(SystemExit, match="holds rows of version 0.0.9, not of"):
+        study.Study(arguments, scene="here")
 
 
 def test_a_row_is_saved_before_it_is_printed(study, tmp_path, monkeypatch):

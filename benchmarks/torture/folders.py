@@ -69,7 +69,6 @@ def _places(draw: Random, place: Path) -> Path:
             Path("/proc/1/nothing/a.json"),
             Path("/dev/null/a.json"),
             place / "/".join(["d" * 200] * 30) / "a.json",
-            Path(),
             place / "\udcff",
         )
     )
