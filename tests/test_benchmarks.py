@@ -153,7 +153,7 @@ def test_a_killed_study_goes_on_with_the_rows_in_its_file(study, tmp_path):
     assert study.Study(arguments, scene="there", resume=False).rows == []
     former = content | {"versions": content["versions"] | {"torchdyn-plan": "0.0.9"}}
     arguments.out.write_text(json.dumps(former))
-    with pytest.raises(SystemExit, match="holds rows of version 0.0.9, not of"):
+    with pytest.raises(SystemExit, match=r"holds rows of version 0\.0\.9, not of"):
         study.Study(arguments, scene="here")
 
 
