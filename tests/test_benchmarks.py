@@ -41,6 +41,7 @@ SMALL = {
 }
 ELSEWHERE = {
     "descriptions",
+    "deviations",
     "measure_arrivals",
     "nearest",
     "paper_scene",

@@ -53,6 +53,7 @@ class TrapperGoalTask(GoalTask):
         self,
         *,
         period: int = 5,
+        redirected: bool = True,
         weights: GoalReward | None = None,
         scene: TrapperScene | str | None = None,
         config: PolicyConfig | None = None,
@@ -63,13 +64,15 @@ class TrapperGoalTask(GoalTask):
 
         Args:
             period: control steps for which an action holds.
+            redirected: goals change in mid-episode; else each episode has one.
             weights: of the reward's terms.
             scene: that the arm stands in, or its name.
             config: of the networks.
             episodes: balls of the split ``dev`` that the policy is scored on; those out of reach do not count.
             num_threads: of the simulation, 0 for all cores.
         """
-        self.period, self.weights, self.scene = period, weights or GoalReward(), trapper_scene(scene)
+        self.period, self.redirected = period, redirected
+        self.weights, self.scene = weights or GoalReward(), trapper_scene(scene)
         self.policy_config, self.episodes, self.num_threads = config or PolicyConfig(), episodes, num_threads
         self.length = round(SECONDS / (period * self.scene.control_step))
         self._reachable: Tensor | None = None
@@ -79,6 +82,7 @@ class TrapperGoalTask(GoalTask):
         return TrapperGoalEnv(
             num_envs,
             period=self.period,
+            redirected=self.redirected,
             weights=self.weights,
             scene=self.scene,
             seed=seed,
@@ -114,5 +118,5 @@ class TrapperGoalTask(GoalTask):
 
     def settings(self) -> dict[str, Any]:
         """What a continued training must share."""
-        shared = {"task": NAME, "scene": self.scene.digest(), "period": self.period}
+        shared = {"task": NAME, "scene": self.scene.digest(), "period": self.period, "redirected": self.redirected}
         return shared | {"reward": asdict(self.weights), "network": asdict(self.policy_config)}
