@@ -448,12 +448,12 @@ def test_results_are_saved_though_nobody_reads_the_table(tmp_path):
     assert {"results.json", "episodes.json", "results.png"} <= {file.name for file in tmp_path.iterdir()}
 
 
-@pytest.mark.parametrize("encoding", ["ascii", "latin-1"])
-def test_a_terminal_without_our_signs_still_gets_the_table(tmp_path, encoding):
+def test_a_terminal_without_our_signs_still_gets_the_table(tmp_path):
+    # Whatever another encoding lacks, this one does.
     words = f"evaluate --planners pursuit --episodes 2 --num-envs 2 --split dev --threads 1 --out {tmp_path}".split()
     run = subprocess.run(
         [sys.executable, "-c", "from torchdyn_plan.cli import main; main()", *words],
-        env={**os.environ, "PYTHONIOENCODING": encoding},
+        env={**os.environ, "PYTHONIOENCODING": "ascii"},
         capture_output=True,
         check=False,
         timeout=120,

@@ -166,16 +166,13 @@ WORKERS = [(SerialEnv, {}), (ParallelEnv, {"mp_start_method": "fork"})]
 @pytest.mark.filterwarnings("error::RuntimeWarning")
 @pytest.mark.parametrize(("kind", "settings"), WORKERS)
 @pytest.mark.parametrize("parts", PARTS)
-@pytest.mark.parametrize("inside", [False, True])
-def test_environments_of_environments_carry_a_memory_that_is_declared(kind, settings, parts, inside):
+def test_environments_carry_a_memory_that_is_declared_to_each_of_them(kind, settings, parts):
     planner = make_planner(**parts)
     workers = [partial(ToyEnv, 2, first_episode=0), partial(ToyEnv, 2, first_episode=50)]
-    # Declared to the environments themselves, or to what they are gathered in.
-    makers = [partial(make_primed, make, planner) for make in workers] if inside else workers
-    env = kind(2, makers, **settings)
+    # test_loops declares it to what they are gathered in.
+    env = kind(2, [partial(make_primed, make, planner) for make in workers], **settings)
     try:
-        whole = env if inside else primed(env, planner)
-        data = whole.rollout(90, planner, break_when_any_done=False)
+        data = env.rollout(90, planner, break_when_any_done=False)
     finally:
         env.close()
     for worker, row in zip(workers, data, strict=True):

@@ -63,9 +63,8 @@ def test_an_arm_that_never_arrives_solves_nothing():
 
 
 def test_measured_arrivals_are_those_of_single_runs(monkeypatch):
-    monkeypatch.setattr(solvability, "SPACING", 0.2)
     monkeypatch.setattr(solvability, "LONGEST", 200)
-    arrivals = solvability.measure_arrivals(ik_planner(chunk=32), SCENE, num_threads=1)
+    arrivals = solvability.measure_arrivals(ik_planner(chunk=32), SCENE, spacing=0.2, num_threads=1)
     count = len(arrivals.steps)
     line = torch.linspace(-SCENE.half_side, SCENE.half_side, count)
     assert line.diff().max() <= 0.2

@@ -159,7 +159,7 @@ class TrapperScene:
         return model
 
 
-SCENES = {"ur5": TrapperScene(), "paper": TrapperScene(arm_speed=2.0, acceleration_limit=150.0)}
+SCENES = {"ur5": TrapperScene(), "paper": TrapperScene(arm_speed=2.0, acceleration_limit=150.0, base_setback=0.01)}
 """Scenes by name: with the limits of a real UR5, and one in which the paper's planner comes near its figures."""
 
 
