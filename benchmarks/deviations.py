@@ -3,8 +3,8 @@
 python benchmarks/deviations.py --out benchmarks/results/deviations.json
 
 The forecaster is told where the cushions are and that the table is symmetric, the policy learns on goals that change in
-mid-episode, and the planner by inverse kinematics hovers, drops and lifts by construction. For each, ours and what it is
-compared with are trained here with the same data, steps and seed, and the same planners play the same episodes on both.
+mid-episode, and the planner by inverse kinematics hovers, drops and lifts by construction. For each of these, ours and
+the paper's way are trained here with the same data, steps and seed, and the same planners play the same episodes.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""Measure the arrival map that ships with the package, from which solvability follows (a minute or two).
+"""Measure an arrival map that ships with the package, from which solvability follows (a minute or two).
 
 python benchmarks/measure_arrivals.py
 """
@@ -10,7 +10,7 @@ from dataclasses import dataclass
 import tyro
 from study import measuring
 
-from torchdyn_plan.envs import TrapperScene
+from torchdyn_plan.envs.trapper.scene import trapper_scene
 from torchdyn_plan.tasks import load_task
 from torchdyn_plan.tasks.trapper.solvable import SHIPPED, arrivals_name, measure_arrivals, save_arrivals
 
@@ -21,11 +21,13 @@ class Arguments:
 
     static: str = "ik"
     """Static planner."""
+    scene: str = "ur5"
+    """Scene of the task."""
 
 
 def main(arguments: Arguments) -> None:
     """Measure and write into the package."""
-    task, scene = load_task("trapper"), TrapperScene()
+    task, scene = load_task("trapper", arguments.scene), trapper_scene(arguments.scene)
     planner = task.static_planner(arguments.static, chunk=task.rows_at_once[1])
     with measuring():
         arrivals = measure_arrivals(planner, scene)
