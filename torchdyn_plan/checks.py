@@ -19,6 +19,22 @@ LARGEST = 10**18 - 1
 MOST_THREADS = 1024
 
 
+POINT_SIZES = (2, 3)
+"""Coordinates D of a point: x and y in a plane, or x, y and z in space."""
+
+
+def check_points(name: str, tensor: Tensor, *leading: int) -> int:
+    """Number of coordinates D of ``tensor`` (*B, *leading, D); raises `InputError` unless it holds points."""
+    if not isinstance(tensor, Tensor):
+        raise InputError(f"{name} must be a torch.Tensor, got {type(tensor).__name__}")
+    size = tensor.shape[-1] if tensor.ndim else 0
+    if size not in POINT_SIZES:
+        shapes = " or ".join(f"({', '.join(['*B', *map(str, leading), str(one)])})" for one in POINT_SIZES)
+        raise InputError(f"{name} must have shape {shapes}, got {tuple(tensor.shape)}")
+    check_trailing_shape(name, tensor, *leading, size)
+    return size
+
+
 def check_trailing_shape(name: str, tensor: Tensor, *trailing: int) -> None:
     """Raise `InputError` unless ``tensor`` has shape ``(*B, *trailing)``."""
     if not isinstance(tensor, Tensor):

@@ -25,7 +25,7 @@ pytestmark = pytest.mark.filterwarnings(NO_MEMORY)
 
 def test_plans_at_the_papers_steps_with_two_arrival_passes_each():
     eta, forecaster = StraightArrival(), Straight()
-    planner = DynamicPlanner(go_straight(), forecaster, eta)
+    planner = DynamicPlanner.paper(go_straight(), forecaster, eta)
     td = observation((2,))
     for step in range(500):
         td["step_count"].fill_(step)

@@ -144,7 +144,7 @@ def test_one_that_waits_and_drops_comes_with_its_spread(shipped, due):
     planner = DynamicPlanner.from_pretrained("trapper-ik-wait_and_drop", chunk=4)
     assert isinstance(planner.forecaster, SpreadForecaster)
     assert (planner.search, planner.maneuver) == (waiting_search(SCENE), WaitAndDrop.of(SCENE))
-    assert (planner.schedule, planner.chunk) == (ReplanSchedule.every(5), 4)
+    assert (planner.schedule, planner.chunk) == (ReplanSchedule.every(5, first_step=13), 4)
     with torch.no_grad():
         td = planner(due.clone())
     assert bool(td["goal"].isfinite().all())
@@ -222,7 +222,7 @@ PLANNERS = {
     "waiting": {
         "forecaster": networks()["spread"],
         "search": waiting_search(SCENE),
-        "schedule": ReplanSchedule.every(5),
+        "schedule": ReplanSchedule.every(5, first_step=13),
         "maneuver": WaitAndDrop.of(SCENE),
         "lost": POCKETED,
         "scene": SCENE.digest(),

@@ -29,6 +29,7 @@ from torchdyn_plan.planners.search import (
 from torchdyn_plan.planners.static.approach import Approach, StraightToGoal
 from torchdyn_plan.planners.static.callable import CallablePlanner
 from torchdyn_plan.planners.static.ik import IKPlanner
+from torchdyn_plan.planners.static.point import PointPlanner
 from torchdyn_plan.planners.static.policy import PolicyPlanner
 from torchdyn_plan.planners.static.proportional import ProportionalController
 from torchdyn_plan.planners.track import KalmanTrack, LeastSquaresTrack, Track, TrackState
@@ -57,6 +58,7 @@ __all__ = [
     "Observation",
     "Plan",
     "PlanStatus",
+    "PointPlanner",
     "PolicyPlanner",
     "ProportionalController",
     "RecordedFuture",
