@@ -33,6 +33,7 @@ class Quick(PointEnv):
     def _start(self, rows, episodes):
         place = super()._start(rows, episodes)
         place[:, 0] = -3.0 + 0.5 * place[:, 0]
+        self.target[rows] = place
         return place
 
     def _flags(self):
@@ -94,7 +95,7 @@ def test_an_arm_is_where_its_planner_says_when_it_says():
     told = planner.arrival_model().arrival(torch.cat([start, 0 * start])[None, None], goal[None, None])
     q, count = start, 0
     while (arm(q)[:3, 3] - goal).norm() > 0.005 and count < 400:
-        action, q = planner.step(q[None], goal[None])
+        _, q = planner.step(q[None], goal[None])
         q, count = q[0], count + 1
     assert not told.never.any()
     assert abs(count - told.steps.item()) < 0.15 * count + 6

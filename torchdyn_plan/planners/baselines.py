@@ -22,10 +22,10 @@ from torchdyn_plan.planners.static.callable import TensorDictFunction
 
 
 class TargetPursuit(Remembering):
-    """Chases the target: at every step the goal is where the target is now (paper, Section IV-A.1)."""
+    """Runs after the target: at every step the goal is where the target is now (paper, Section IV-A.1)."""
 
     def __init__(self, static: StaticPlanner, *, scene: str | None = None) -> None:
-        """Chase with ``static``, a planner for a static goal; ``scene`` is the digest of its scene, if it has one."""
+        """Run with ``static``, a planner for a static goal; ``scene`` is the digest of its scene, if it has one."""
         super().__init__()
         self.static, self.scene = TensorDictFunction.wrap(static), scene
         self.in_keys = keys_read(self.static, keys.TARGET_POS)
