@@ -32,7 +32,8 @@ class Quick(PointEnv):
 
     def _start(self, rows, episodes):
         place = super()._start(rows, episodes)
-        place[:, 0] = -3.0 + 0.5 * place[:, 0]
+        place[:, 0] = -2.0 + 0.3 * place[:, 0]
+        place[:, 1] = 1.5 + 0.3 * place[:, 1]
         self.target[rows] = place
         return place
 
@@ -57,8 +58,8 @@ def met(planner):
 
 def test_as_it_comes_it_beats_pursuit_and_the_papers_clock():
     ours = met(DynamicPlanner(static(), eta=steps))
-    assert ours > met(TargetPursuit(static())) + 0.3
-    assert ours > met(DynamicPlanner.paper(static(), ConstantVelocity(), steps)) + 0.3
+    assert ours > met(TargetPursuit(static())) + 0.5
+    assert ours > met(DynamicPlanner.paper(static(), ConstantVelocity(), steps)) + 0.1
     assert ours >= 0.95
 
 

@@ -10,6 +10,7 @@ from torchdyn_plan.planners.baselines import (
 )
 from torchdyn_plan.planners.delivery import Delayed, Delivery
 from torchdyn_plan.planners.maneuver import GoTo, Maneuver
+from torchdyn_plan.planners.match_velocity import MatchPhase, MatchVelocity
 from torchdyn_plan.planners.observation import Observation
 from torchdyn_plan.planners.plan import Lost, LostBelow, Plan, PlanStatus
 from torchdyn_plan.planners.planner import DynamicPlanner, observe
@@ -54,6 +55,8 @@ __all__ = [
     "Lost",
     "LostBelow",
     "Maneuver",
+    "MatchPhase",
+    "MatchVelocity",
     "Meeting",
     "Observation",
     "Plan",

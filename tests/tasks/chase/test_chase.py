@@ -56,11 +56,11 @@ def test_walkers_go_at_their_speed_and_turn_as_they_should(turning):
     time = 0.01 * torch.arange(300).expand(40, -1)
     path = walks.at(time).double()
     step = path.diff(dim=1)
-    torch.testing.assert_close(step.norm(dim=-1) / 0.01, torch.full((40, 299), 1.2).double(), atol=2e-3, rtol=0)
+    torch.testing.assert_close(step.norm(dim=-1) / 0.01, torch.full_like(step[..., 0], 1.2), atol=2e-3, rtol=0)
     angle = torch.atan2(step[..., 1], step[..., 0])
     turned = torch.remainder(angle[:, -1] - angle[:, 0] + math.pi, 2 * math.pi) - math.pi
     expected = torch.remainder(walks.turning * 2.98 + math.pi, 2 * math.pi) - math.pi
-    torch.testing.assert_close(turned, expected, atol=5e-3, rtol=0)
+    torch.testing.assert_close(turned, expected.to(turned.dtype), atol=5e-3, rtol=0)
     away = walks.start.norm(dim=-1)
     assert away.min() >= WORLD.nearest
     assert away.max() <= WORLD.farthest

@@ -15,6 +15,8 @@ from torchdyn_plan.planners.static.base import StaticPlannerModule
 
 NEAR = 1e-9
 """Nearer to its goal than this a point has no direction to go [m]."""
+FADE = 0.25
+"""Share of the last bit of way that is covered in a control step."""
 
 
 class PointPlanner(StaticPlannerModule):
@@ -44,10 +46,10 @@ class PointPlanner(StaticPlannerModule):
         far = torch.linalg.vector_norm(offset, dim=-1, keepdim=True)
         fastest = torch.full_like(far, limits.speed).masked_fill(far <= NEAR, 0.0)
         if limits.stops:
-            # The last step brakes as well: v² / 2a + v dt / 2 ≤ way.
-            lag = 0.5 * limits.acceleration * limits.control_step
-            fastest = fastest.minimum((lag**2 + 2.0 * limits.acceleration * far).sqrt() - lag)
-            fastest = fastest.minimum(far / limits.control_step)
+            # It brakes a step later than it sees: v²/2a + v dt + a dt²/2 ≤ way. The last bit is left to fade.
+            braked = limits.acceleration * limits.control_step
+            fading = FADE * (far / limits.control_step).clamp(max=braked)
+            fastest = fastest.minimum(((2.0 * limits.acceleration * far).sqrt() - braked).maximum(fading))
         tensordict.set(keys.ACTION, offset / far.clamp_min(NEAR) * (fastest / limits.speed))
         return tensordict
 
