@@ -6,7 +6,7 @@ Values are looked at here, and nowhere while a model is compiled. Under ``torch.
 
 import difflib
 import math
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 
 import torch
 from torch import Tensor
@@ -120,6 +120,15 @@ def check_number(
     if not minimum <= value <= maximum:
         bounds = f">= {minimum:g}" if maximum == math.inf else f"in [{minimum:g}, {maximum:g}]"
         raise InputError(f"{name} must be {bounds}, got {value!r}")
+
+
+def check_vector(name: str, values: Sequence[float]) -> tuple[float, ...]:
+    """``values`` as a tuple; raises `InputError` unless they are a number for each axis of a plane or of space."""
+    if not isinstance(values, (tuple, list)) or len(values) not in POINT_SIZES:
+        raise InputError(f"{name} must be two or three numbers, got {values!r}")
+    for value in values:
+        check_number(name, value)
+    return tuple(map(float, values))
 
 
 def check_count(name: str, value: int, *, minimum: int = 1, maximum: int = 10_000_000) -> None:

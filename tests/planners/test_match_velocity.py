@@ -8,7 +8,6 @@ from torchdyn_plan.errors import InputError
 from torchdyn_plan.nets import ConstantVelocity
 from torchdyn_plan.planners import (
     DynamicPlanner,
-    ExactSearch,
     MatchPhase,
     MatchVelocity,
     ProportionalController,
@@ -21,12 +20,11 @@ HOVER, DESCENT, HOLD = 0.1, 20, 5
 MANEUVER = MatchVelocity(hover=HOVER, descent_steps=DESCENT, hold_steps=HOLD, lift=0.2)
 
 
-def make_planner(maneuver=MANEUVER, **parts):
+def make_planner(maneuver=MANEUVER, coordinates=3, **parts):
     def steps(robot_state, goal):
-        # To above the target; the rest is the descent.
         return (goal - robot_state).abs().amax(-1) / STRIDE
 
-    search = ExactSearch(stride=1, first=1, descent_steps=float(maneuver.descent_steps))
+    search = maneuver.search(coordinates=coordinates)
     static = ProportionalController(gain=1.0 / STRIDE)
     schedule = ReplanSchedule.every(3, first_step=1)
     own = {"search": search, "schedule": schedule, "maneuver": maneuver}
@@ -132,7 +130,7 @@ def test_a_target_that_was_missed_is_hovered_over_again():
 
 def test_a_plane_has_an_axis_too_and_any_axis_will_do():
     across = MatchVelocity(hover=HOVER, descent_steps=DESCENT, hold_steps=HOLD, axis=(0.0, -2.0))
-    tool, target, _, phase = run(make_planner(across), BELT[:, :2], SPEEDS[:, :2])
+    tool, target, _, phase = run(make_planner(across, coordinates=2), BELT[:, :2], SPEEDS[:, :2])
     step = contact(phase)
     torch.testing.assert_close(at(tool, step), at(target, step), atol=3e-4, rtol=0)
     begun = step - DESCENT // 2
@@ -188,6 +186,10 @@ def test_nonsense_is_named(change, message):
 
 
 def test_an_axis_of_another_space_is_named():
-    planner = make_planner(MatchVelocity(hover=0.1, descent_steps=5, axis=(0.0, 1.0)))
+    flat = MatchVelocity(hover=0.1, descent_steps=5, axis=(0.0, 1.0))
     with pytest.raises(InputError, match="axis has 2 numbers, but places have 3 coordinates"):
-        run(planner, BELT, SPEEDS, steps=3)
+        flat.search()
+    with pytest.raises(InputError, match="offset has 2 numbers, but places 3 coordinates"):
+        run(make_planner(flat, coordinates=2), BELT, SPEEDS, steps=3)
+    with pytest.raises(InputError, match="axis has 2 numbers, but places have 3 coordinates"):
+        run(make_planner(MANEUVER).with_parts(maneuver=flat), BELT, SPEEDS, steps=3)

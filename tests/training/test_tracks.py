@@ -195,7 +195,7 @@ def test_the_same_file_again_changes_nothing_and_another_is_refused(tmp_path):
 
 def test_tracks_that_are_too_short_for_the_forecaster_are_refused(tmp_path):
     rows, *_ = samples(length=3)
-    with pytest.raises(InputError, match="needs 2 tracks of .* control steps"):
+    with pytest.raises(InputError, match=r"needs 2 tracks of .* control steps"):
         collect_tracks(TOY, write_csv(tmp_path / "a.csv", rows), tmp_path / "data")
 
 

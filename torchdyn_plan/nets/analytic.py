@@ -11,7 +11,7 @@ import torch
 from torch import Tensor
 
 from torchdyn_plan import keys
-from torchdyn_plan.checks import POINT_SIZES, check_number, check_points, check_trailing_shape
+from torchdyn_plan.checks import check_number, check_points, check_trailing_shape, check_vector
 from torchdyn_plan.errors import InputError
 from torchdyn_plan.nets.distributions import Spread
 from torchdyn_plan.nets.forecast import Forecast, ForecastModel
@@ -118,7 +118,7 @@ class Ballistic(AnalyticForecast):
     def __init__(self, *, gravity: Sequence[float] = (0.0, 0.0, -9.81), **settings: Any) -> None:
         """Fall with ``gravity``, D numbers [m/s², world]; ``settings`` are those of `AnalyticForecast`."""
         super().__init__(**settings)
-        self.gravity = _vector("gravity", gravity)
+        self.gravity = check_vector("gravity", gravity)
 
     def follow(self, history: Tensor, velocity: Tensor, time: Tensor, deviation: Tensor) -> Forecast:
         """As of `AnalyticForecast`."""
@@ -301,12 +301,3 @@ def normal_spread(deviation: Tensor, gone: Tensor | None = None) -> Spread:
     """The spread nearest to a normal distribution with ``deviation`` (*B, F, 2) along x and y [m]; surely not gone."""
     gone = torch.zeros_like(deviation[..., 0]) if gone is None else gone
     return Spread(MEDIAN * deviation, torch.full_like(deviation, SHAPE), gone)
-
-
-def _vector(name: str, values: Sequence[float]) -> tuple[float, ...]:
-    """``values`` as a tuple; raises `InputError` unless they are a number for each axis of a plane or of space."""
-    if not isinstance(values, (tuple, list)) or len(values) not in POINT_SIZES:
-        raise InputError(f"{name} must be two or three numbers, got {values!r}")
-    for value in values:
-        check_number(name, value)
-    return tuple(map(float, values))

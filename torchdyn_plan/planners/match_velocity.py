@@ -3,18 +3,18 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
 from dataclasses import dataclass
 from enum import IntEnum
-from typing import ClassVar, NamedTuple
+from typing import Any, ClassVar, NamedTuple
 
 import torch
 from torch import Tensor
 
-from torchdyn_plan.checks import POINT_SIZES, check_number
+from torchdyn_plan.checks import check_number, check_vector
 from torchdyn_plan.errors import InputError
 from torchdyn_plan.planners.observation import Observation
 from torchdyn_plan.planners.plan import Plan
+from torchdyn_plan.planners.search.exact import ExactSearch
 
 
 class MatchPhase(IntEnum):
@@ -53,12 +53,12 @@ class MatchVelocity:
     is 1 and its derivatives are 0 at the end, x(n) = p(n) and x'(n) = p'(n). Then it follows the path for
     ``hold_steps``, and rises while it slows down. All of it is said through the goal.
 
-    The search is to leave it that time: ``ExactSearch(descent_steps=…)`` with the same number. `MatchPhase` is what
-    ``phase`` makes of ``plan.match_step``: a gripper closes in `MatchPhase.HOLD`.
+    The plan's goal is where it waits, and its time that of the contact: `search` makes a search that finds such plans.
+    `MatchPhase` is what ``phase`` makes of ``plan.match_step``: a gripper closes in `MatchPhase.HOLD`.
     """
 
     hover: float
-    """How far from the target it waits, along the axis [m]."""
+    """How far from the target it waits, along the axis, by its `search` [m]."""
     descent_steps: int
     """Control steps from when it begins to follow the target to the contact."""
     hold_steps: int = 0
@@ -94,12 +94,26 @@ class MatchVelocity:
         if not self.within > 0.0:
             raise InputError(f"within must be positive, got {self.within!r}")
         if self.axis is not None:
-            object.__setattr__(self, "axis", _axis(self.axis))
+            object.__setattr__(self, "axis", check_vector("axis", self.axis))
+            if not any(self.axis):
+                raise InputError(f"axis must be a direction, got {self.axis!r}")
 
     @property
     def lookahead(self) -> int:
         """Positions of the target's path that it reads: that of its goal, and the next one."""
         return self.lead_steps + 2
+
+    def search(self, *, coordinates: int = 3, **settings: Any) -> ExactSearch:
+        """A search for the earliest meeting that leaves the tool time to come down from where it hovers.
+
+        Args:
+            coordinates: D of places.
+            settings: of `ExactSearch`, in place of those that are chosen here: all steps of the forecast are looked at,
+                and a meeting that is planned is kept unless another is 50 control steps earlier.
+        """
+        offset = tuple((self.hover * self._up(torch.zeros(coordinates, dtype=torch.float64))).tolist())
+        own: dict[str, Any] = {"stride": 1, "first": 1, "offset": offset, "descent_steps": float(self.descent_steps)}
+        return ExactSearch(**(own | {"margin": 1.0, "switching_cost": 1.0} | settings))
 
     def start(self, observation: Observation) -> MatchState:
         """Nothing has begun."""
@@ -117,9 +131,8 @@ class MatchVelocity:
         came = torch.where(begins.unsqueeze(-1), tool_pos, state.match_from)
         came = torch.where(rises.unsqueeze(-1), place, came)
         velocity = torch.where(rises.unsqueeze(-1), later - place, state.match_velocity)
-        goal = torch.where(holds.unsqueeze(-1), plan.goal, plan.goal + self.hover * up)
         phase = self.phase(step).unsqueeze(-1)
-        goal = torch.where(phase == MatchPhase.DOWN, self._down(step, came, place, up), goal)
+        goal = torch.where(phase == MatchPhase.DOWN, self._down(step, came, place, up), plan.goal)
         goal = torch.where(phase == MatchPhase.HOLD, place, goal)
         goal = torch.where(phase == MatchPhase.LIFT, self._lifted(step, came, velocity, up), goal)
         return goal, MatchState(step, came, velocity)
@@ -167,14 +180,3 @@ def smooth(share: Tensor) -> Tensor:
     """10 s³ - 15 s⁴ + 6 s⁵ of ``share`` (*B,) cut to 0 … 1: from 0 to 1, its first two derivatives 0 at both ends."""
     s = share.clamp(0.0, 1.0)
     return s**3 * (10.0 + s * (6.0 * s - 15.0))
-
-
-def _axis(values: Sequence[float]) -> tuple[float, ...]:
-    """``values`` as a tuple; raises `InputError` unless they are a direction in a plane or in space."""
-    if not isinstance(values, (tuple, list)) or len(values) not in POINT_SIZES:
-        raise InputError(f"axis must be two or three numbers, got {values!r}")
-    for value in values:
-        check_number("axis", value)
-    if not any(values):
-        raise InputError(f"axis must be a direction, got {values!r}")
-    return tuple(map(float, values))

@@ -191,7 +191,7 @@ def _recorder(task: Task, wanted: _Wanted, planner: StaticPlanner | None) -> Cal
     if wanted.what == "paths":
         record_paths = task.record_paths
         if record_paths is None:
-            raise InputError(f"{task.name} records no paths")
+            raise InputError(f"{task.name} records no paths: give a file of tracks, by --from")
         return lambda index: record_paths(wanted.blocks(index), seed=wanted.seed, num_threads=threads)
     record_arrivals = task.record_arrivals
     if record_arrivals is None:

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, NamedTuple
 import torch
 from torch import Tensor
 
-from torchdyn_plan.checks import POINT_SIZES, check_number, check_points, check_trailing_shape
+from torchdyn_plan.checks import POINT_SIZES, check_number, check_points, check_trailing_shape, check_vector
 from torchdyn_plan.errors import InputError
 from torchdyn_plan.planners.search.meeting import NO_CONTEXT, Meeting, SearchContext
 from torchdyn_plan.precision import exact_product
@@ -73,6 +73,8 @@ class ExactSearch:
     """Height of the goals in space, above the target to wait there [m]; None for the target's own."""
     half_extent: float | None = None
     """Goals are clamped to the square of this half-side, where the tool can be; None to leave them [m]."""
+    offset: tuple[float, ...] | None = None
+    """From the target to the goal, where the tool waits, a number for each axis [m]; None for no way at all."""
     descent_steps: float = 0.0
     """Control steps that the robot needs from the goal to the target."""
     margin: float = 0.0
@@ -128,6 +130,8 @@ class ExactSearch:
                 raise InputError(f"base_pos must be x and y [m], got {self.base_pos!r}")
             for coordinate in self.base_pos:
                 check_number("base_pos", coordinate)
+        if self.offset is not None:
+            object.__setattr__(self, "offset", check_vector("offset", self.offset))
         if self.probability_weight > 0.0 and self.coarse > 1:
             raise InputError(f"a probability_weight needs all candidates at once: coarse must be 1, got {self.coarse}")
         if self.half_extent is not None:
@@ -235,6 +239,10 @@ class ExactSearch:
 
     def goals(self, places: Tensor) -> Tensor:
         """Where the tool is sent to meet a target at ``places`` (*B, D) [m, world]."""
+        if self.offset is not None:
+            if len(self.offset) != places.shape[-1]:
+                raise InputError(f"offset has {len(self.offset)} numbers, but places {places.shape[-1]} coordinates")
+            places = places + places.new_tensor(self.offset)
         level, height = places[..., :2], places[..., 2:]
         if self.half_extent is not None:
             level = level.clamp(-self.half_extent, self.half_extent)
