@@ -126,7 +126,7 @@ def text(name, content):
 
 
 BAD = {
-    "no number": (spoiled(17, "x", "left"), r"a.csv, row 17, column x: must be a number of at most .* got 'left'"),
+    "no number": (spoiled(17, "x", "left"), r"a.csv', row 17, column x: must be a number of at most .* got 'left'"),
     "nothing": (spoiled(5, "y", ""), r"row 5, column y: must be a number .* got ''"),
     "not a number": (spoiled(5, "z", "nan"), r"row 5, column z: must be a number"),
     "too far": (spoiled(9, "x", 1e9), r"row 9, column x: must be a number of at most 1e\+06 m, got '1000000000.0'"),
@@ -142,7 +142,10 @@ BAD = {
     "other": (text("a.xlsx", b""), "must be one of .csv, .parquet, .npy, .npz"),
     "no array": (text("a.npy", b"what"), "is no NumPy file"),
     "three columns": (array("a.npy", np.zeros((5, 3))), r"must have shape \(n, 4\), .* got \(5, 3\)"),
-    "in an array": (array("a.npy", np.array([[0, 0, 0, 0], [1, np.nan, 0, 0.0]])), "a.npy, row 1, column x"),
+    "in an array": (
+        array("a.npy", np.array([[0, 0, 0, 0], [1, np.nan, 0, 0.0]])),
+        r"a.npy', row 1, column x: must be a number .* got nan",
+    ),
     "lengths": (
         array("a.npz", None, lambda file, _: np.savez(file, time=np.zeros(3), x=np.zeros(3), y=np.zeros(2))),
         "columns must be of one length",

@@ -157,7 +157,8 @@ def _numbers(file: Path, name: str, values: Any, rows: np.ndarray[Any, Any]) -> 
     if len(bad):
         place = f"{short_path(file)}, row {rows[bad[0]]}, column {name}"
         size = "" if name == "time" else f" of at most {FARTHEST:g} m"
-        raise InputError(f"{place}: must be a number{size}, got {values[bad[0]]!r}")
+        value = values[bad[0]]
+        raise InputError(f"{place}: must be a number{size}, got {value.item() if hasattr(value, 'item') else value!r}")
     return found
 
 

@@ -31,6 +31,12 @@ def test_specs_hold(settings):
     check_env_specs(ChaseEnv(**{"seed": 0, **settings}))
 
 
+def test_a_walker_that_is_to_rest_stands_still():
+    rollout = ChaseEnv(3, seed=0, static_target=True).rollout(5, break_when_any_done=False)
+    assert torch.equal(rollout["target_pos"], rollout["target_pos"][:, :1].expand(-1, 5, -1))
+    assert torch.equal(rollout["goal"], rollout["target_pos"])
+
+
 def test_a_base_at_full_throttle_goes_as_far_as_the_closed_form_says():
     heading = torch.nn.functional.normalize(torch.randn(5, 2, generator=torch.Generator().manual_seed(0)), dim=-1)
     # Walkers are far: nothing ends.

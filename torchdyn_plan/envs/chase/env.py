@@ -120,7 +120,8 @@ class ChaseEnv(MovingTargetEnv):
             "history": 8,
         }
         super().__init__(num_envs, state_size=4, action_size=2, coordinates=2, **(fixed | series))
-        self.world, self.speed, self.turning = world, speed, turning
+        # A walker that is to rest stands still.
+        self.world, self.speed, self.turning = world, 0.0 if self.static_target else speed, turning
         self.scene_digest = world.digest()
         self.tool_pos, self.velocity = torch.zeros(2, num_envs, 2).unbind(0)
         self.walks = self._draw(torch.zeros(num_envs, dtype=torch.int64))
