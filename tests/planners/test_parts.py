@@ -116,7 +116,7 @@ def test_functions_may_stand_in_for_any_network():
     def steps(robot_state, goal):
         return (goal - robot_state[..., -3:]).norm(dim=-1) / 0.01
 
-    planner = DynamicPlanner(go_straight(), at_rest, steps, schedule=SCHEDULES[0])
+    planner = DynamicPlanner.paper(go_straight(), at_rest, steps, schedule=SCHEDULES[0])
     assert isinstance(planner.forecaster, FunctionForecast)
     assert isinstance(planner.eta, FunctionArrival)
     td = world(3).run(planner, 4)[-1]

@@ -117,7 +117,7 @@ def test_networks_are_found_as_parameters_and_a_callable_may_stand_in_for_any_pa
     def stay(td):
         return td.set("action", torch.zeros_like(td["tool_pos"]))
 
-    simple = DynamicPlanner(stay, lambda history: history, StraightArrival(), schedule=SCHEDULE)
+    simple = DynamicPlanner.paper(stay, lambda history: history, StraightArrival(), schedule=SCHEDULE)
     assert not simple(observation((2,), step=3))["action"].any()
 
 
