@@ -113,7 +113,8 @@ class MatchVelocity:
         """
         offset = tuple((self.hover * self._up(torch.zeros(coordinates, dtype=torch.float64))).tolist())
         own: dict[str, Any] = {"stride": 1, "first": 1, "offset": offset, "descent_steps": float(self.descent_steps)}
-        return ExactSearch(**(own | {"margin": 1.0, "switching_cost": 1.0} | settings))
+        own |= {"margin": 1.0, "switching_cost": 1.0}
+        return ExactSearch(**(own | settings))
 
     def start(self, observation: Observation) -> MatchState:
         """Nothing has begun."""

@@ -5,6 +5,7 @@ from __future__ import annotations
 import csv
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
+from importlib import import_module
 from pathlib import Path
 from typing import Any
 
@@ -204,13 +205,12 @@ def _read_csv(file: Path) -> tuple[dict[str, Any], int]:
 def _read_parquet(file: Path) -> tuple[dict[str, Any], int]:
     """Columns of a Parquet file, as `_read_csv`."""
     try:
-        from pyarrow import ArrowException
-        from pyarrow.parquet import read_table
+        arrow, parquet = import_module("pyarrow"), import_module("pyarrow.parquet")
     except ImportError as error:
         raise InputError(f"{short_path(file)} needs pyarrow, which is not installed: pip install pyarrow") from error
     try:
-        table = read_table(file)
-    except (ArrowException, OSError) as error:
+        table = parquet.read_table(file)
+    except (arrow.ArrowException, OSError) as error:
         raise InputError(f"{short_path(file)} is no Parquet file: {error}") from error
     # Missing values become None, and no numbers.
     return _chosen(file, {name: table[name].to_pylist() for name in table.column_names}), 0
