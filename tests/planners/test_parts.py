@@ -123,7 +123,7 @@ def test_functions_may_stand_in_for_any_network():
     torch.testing.assert_close(td["goal"], td["target_pos"])
     module = nn.Identity()
     assert "function" in dict(DynamicPlanner(go_straight(), module, steps).forecaster.named_children())
-    for bad in ({"forecaster": 3}, {"eta": None}, {"static": "ik"}):
+    for bad in ({"forecaster": 3}, {"eta": 3}, {"static": "ik"}):
         with pytest.raises(InputError, match=f"{next(iter(bad))} must be"):
             make_planner().with_parts(**bad)
 

@@ -13,6 +13,7 @@ from torch.func import debug_unwrap
 
 from torchdyn_plan import keys
 from torchdyn_plan.checks import POINT_SIZES, check_points, check_trailing_shape
+from torchdyn_plan.errors import InputError
 from torchdyn_plan.nets.forecast import Forecast, ForecastModel
 from torchdyn_plan.planners.judging import GOOD, LARGEST, act, judge
 from torchdyn_plan.planners.observation import SEEN_BY_ALL, Observation
@@ -102,8 +103,10 @@ def observe(tensordict: TensorDictBase, forecaster: ForecastModel) -> Observatio
     if not torch.compiler.is_compiling():
         size = tool_pos.shape[-1] if tool_pos.ndim else 0
         if size not in POINT_SIZES or target_pos.shape[-1:] != (size,):
-            size = check_points(keys.TOOL_POS, tool_pos)
-            check_trailing_shape(keys.TARGET_POS, target_pos, size)
+            size, other = check_points(keys.TOOL_POS, tool_pos), check_points(keys.TARGET_POS, target_pos)
+            raise InputError(
+                f"{keys.TOOL_POS} and {keys.TARGET_POS} must be of as many coordinates, got {size} and {other}"
+            )
         if keys.TARGET_HISTORY in forecaster.in_keys:
             history = seen[forecaster.in_keys.index(keys.TARGET_HISTORY)]
             length = forecaster.history or (history.shape[-2] if history.ndim > 1 else 2)
