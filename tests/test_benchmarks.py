@@ -17,6 +17,7 @@ SMALL = {
     "ablation": "--velocities 3 --episodes 2 --num-envs 2 --split dev",
     "braking": "--episodes 2 --num-envs 2 --threads 1",
     "arrival_time": "--batches 2 --cases 3 --seconds 0.01",
+    "chase": "--rows 8",
     "calibration": "--episodes 8 --pursuit-episodes 8 --split dev",
     "ceiling": "--velocities 5 --episodes 3 --spacing 60 --meetings 1 --leads 7 --rows 64 --split dev",
     "count_calls": "--planners corner --batch 2",

@@ -10,7 +10,9 @@ from tests.scripts import run
 from torchdyn_plan.cli import commands, main
 
 ROOT = Path(__file__).parent.parent
-PAGES = [ROOT / "README.md", *sorted((ROOT / "docs").glob("*.md"))]
+WALKS = {"own-task.md"}
+"""Pages whose blocks build on one another: `test_a_walk_is_walked` runs them in order."""
+PAGES = [ROOT / "README.md", *sorted(file for file in (ROOT / "docs").glob("*.md") if file.name not in WALKS)]
 
 
 def blocks(language):
@@ -66,7 +68,36 @@ def test_commands_are_understood(words, monkeypatch):
     assert len(understood) == 1
 
 
-@pytest.mark.parametrize("page", PAGES, ids=lambda page: page.name)
+def steps_of(page):
+    """Code blocks of a page in their order: language, text, and what its last comment says that it prints."""
+    for language, text in re.findall(r"```(python|bash)\n(.*?)```", page.read_text(), re.DOTALL):
+        comment = re.search(r"^ *print\(.*#  *(.*)$", text, re.MULTILINE)
+        yield language, text, comment and comment[1]
+
+
+@pytest.mark.parametrize("name", sorted(WALKS))
+def test_a_walk_is_walked(name, tmp_path):
+    printed = ""
+    for language, text, says in steps_of(ROOT / "docs" / name):
+        file = re.match(r"# (\S+\.py)\n", text)
+        if file:
+            (tmp_path / file[1]).write_text(text)
+            continue
+        commands = [shlex.split(line)[1:] for line in text.splitlines()] if language == "bash" else []
+        told = f"from torchdyn_plan.cli import main\nfor words in {commands}:\n    main(words)"
+        code = text if language == "python" else told
+        ran = run(f"import sys\nsys.path.insert(0, '.')\n{code}", cwd=tmp_path)
+        assert ran.returncode == 0, (text, ran.stderr)
+        if says:
+            same(says, ran.stdout)
+        printed += ran.stdout
+    table = re.findall(r"^(pursuit|straight|learned) +(\d+) %", printed, re.MULTILINE)
+    met = {planner: int(share) for planner, share in table}
+    assert met["learned"] >= met["straight"] >= met["pursuit"], printed
+    assert met["learned"] >= 90, printed
+
+
+@pytest.mark.parametrize("page", [ROOT / "README.md", *(ROOT / "docs").glob("*.md")], ids=lambda page: page.name)
 def test_links_lead_to_files(page):
     for link in re.findall(r"\]\(([^)#]+)\)", page.read_text()):
         if not link.startswith("http"):

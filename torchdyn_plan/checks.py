@@ -6,7 +6,7 @@ Values are looked at here, and nowhere while a model is compiled. Under ``torch.
 
 import difflib
 import math
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 
 import torch
 from torch import Tensor
@@ -17,6 +17,22 @@ from torchdyn_plan.errors import InputError
 LARGEST = 10**18 - 1
 """No whole number that somebody means is larger."""
 MOST_THREADS = 1024
+
+
+POINT_SIZES = (2, 3)
+"""Coordinates D of a point: x and y in a plane, or x, y and z in space."""
+
+
+def check_points(name: str, tensor: Tensor, *leading: int) -> int:
+    """Number of coordinates D of ``tensor`` (*B, *leading, D); raises `InputError` unless it holds points."""
+    if not isinstance(tensor, Tensor):
+        raise InputError(f"{name} must be a torch.Tensor, got {type(tensor).__name__}")
+    size = tensor.shape[-1] if tensor.ndim else 0
+    if size not in POINT_SIZES:
+        shapes = " or ".join(f"({', '.join(['*B', *map(str, leading), str(one)])})" for one in POINT_SIZES)
+        raise InputError(f"{name} must have shape {shapes}, got {tuple(tensor.shape)}")
+    check_trailing_shape(name, tensor, *leading, size)
+    return size
 
 
 def check_trailing_shape(name: str, tensor: Tensor, *trailing: int) -> None:
@@ -104,6 +120,15 @@ def check_number(
     if not minimum <= value <= maximum:
         bounds = f">= {minimum:g}" if maximum == math.inf else f"in [{minimum:g}, {maximum:g}]"
         raise InputError(f"{name} must be {bounds}, got {value!r}")
+
+
+def check_vector(name: str, values: Sequence[float]) -> tuple[float, ...]:
+    """``values`` as a tuple; raises `InputError` unless they are a number for each axis of a plane or of space."""
+    if not isinstance(values, (tuple, list)) or len(values) not in POINT_SIZES:
+        raise InputError(f"{name} must be two or three numbers, got {values!r}")
+    for value in values:
+        check_number(name, value)
+    return tuple(map(float, values))
 
 
 def check_count(name: str, value: int, *, minimum: int = 1, maximum: int = 10_000_000) -> None:

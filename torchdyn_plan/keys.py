@@ -37,8 +37,8 @@ class Key:
 
     name: str
     shape: tuple[str | int, ...]
-    """Trailing shape after the batch: N joints, A action size, H history, F horizon, S robot state size, M measurements
-    that can come at a step."""
+    """Trailing shape after the batch: D coordinates of a point (2 in a plane, 3 in space), N joints, A action size,
+    H history, F horizon, S robot state size, M measurements that can come at a step."""
     meaning: str
     writer: str
 
@@ -46,30 +46,32 @@ class Key:
 KEYS: tuple[Key, ...] = (
     Key(name=JOINT_POS, shape=("N",), meaning="joint angles [rad]", writer="env"),
     Key(name=JOINT_VEL, shape=("N",), meaning="joint speeds [rad/s]", writer="env"),
-    Key(name=TOOL_POS, shape=(3,), meaning="place of the tool [m, world]", writer="env"),
-    Key(name=TARGET_POS, shape=(3,), meaning="centre of the target [m, world]", writer="env"),
-    Key(name=TARGET_HISTORY, shape=("H", 3), meaning="target positions, oldest first [m, world]", writer="env"),
+    Key(name=TOOL_POS, shape=("D",), meaning="place of the tool [m, world]", writer="env"),
+    Key(name=TARGET_POS, shape=("D",), meaning="centre of the target [m, world]", writer="env"),
+    Key(name=TARGET_HISTORY, shape=("H", "D"), meaning="target positions, oldest first [m, world]", writer="env"),
     Key(name=HISTORY_LENGTH, shape=(), meaning="samples in the history that are no padding", writer="env"),
     Key(name=ROBOT_STATE, shape=("S",), meaning="what a policy or an ETA network reads", writer="env"),
     Key(name=OBSERVATION, shape=("S",), meaning="robot state under TorchRL's name", writer="env"),
-    Key(name=ACHIEVED_GOAL, shape=(3,), meaning="tool position under Gymnasium's name [m, world]", writer="env"),
-    Key(name=DESIRED_GOAL, shape=(3,), meaning="place to reach [m, world]", writer="env"),
+    Key(name=ACHIEVED_GOAL, shape=("D",), meaning="tool position under Gymnasium's name [m, world]", writer="env"),
+    Key(name=DESIRED_GOAL, shape=("D",), meaning="place to reach [m, world]", writer="env"),
     Key(name=STEP_COUNT, shape=(1,), meaning="control steps since the reset", writer="env"),
     Key(name=EPISODE, shape=(), meaning="index of the episode within its split and seed", writer="env"),
-    Key(name=GOAL, shape=(3,), meaning="place the static planner is sent to [m, world]", writer="planner"),
+    Key(name=GOAL, shape=("D",), meaning="place the static planner is sent to [m, world]", writer="planner"),
     Key(name=ARRIVAL_STEPS, shape=(), meaning="control steps from now to the meeting", writer="planner"),
     Key(name=ACTION, shape=("A",), meaning="what the robot is told to do, each entry -1 to 1", writer="static planner"),
     Key(
         name=MEASURED_POS,
-        shape=("M", 3),
+        shape=("M", "D"),
         meaning="measurements that come now [m, world]",
         writer="sensor",
     ),
     Key(name=MEASURED_TIME, shape=("M",), meaning="when they were taken [s since the reset]", writer="sensor"),
-    Key(name=TRUE_TARGET_POS, shape=(3,), meaning="the target itself, for those who judge [m, world]", writer="sensor"),
+    Key(
+        name=TRUE_TARGET_POS, shape=("D",), meaning="the target itself, for those who judge [m, world]", writer="sensor"
+    ),
     Key(name=TARGET_COVARIANCE, shape=(2, 2), meaning="of position and velocity [m², m²/s, m²/s²]", writer="track"),
-    Key(name=TARGET_FUTURE, shape=("F", 3), meaning="recorded truth, from step 0 on [m, world]", writer="evaluation"),
-    Key(name=TRUE_FUTURE, shape=("F", 3), meaning="the truth from the next step on [m, world]", writer="evaluation"),
+    Key(name=TARGET_FUTURE, shape=("F", "D"), meaning="recorded truth, from step 0 on [m, world]", writer="evaluation"),
+    Key(name=TRUE_FUTURE, shape=("F", "D"), meaning="the truth from the next step on [m, world]", writer="evaluation"),
     Key(name=PLAN, shape=(), meaning="the planner's memory between steps (nested)", writer="planner"),
 )
 """Every shared key. Further entries below ``plan`` belong to the planner that wrote them."""

@@ -27,7 +27,7 @@ def meet_in_hundred(forecast, target_pos, eta, context=None):
 
 def make_planner(**parts):
     parts.setdefault("search", meet_in_hundred)
-    return DynamicPlanner(CallablePlanner(stand_still), straight_on, always_forty, **parts)
+    return DynamicPlanner.paper(CallablePlanner(stand_still), straight_on, always_forty, **parts)
 
 
 def stand_on_tensordict(tensordict):

@@ -37,7 +37,7 @@ def planner():
 def untrained(static, **parts):
     torch.manual_seed(0)
     networks = Forecaster(square_symmetry=True, half_extent=0.75), ETANetwork()
-    return DynamicPlanner(static, *networks, **parts).eval().requires_grad_(False)
+    return DynamicPlanner.paper(static, *networks, **parts).eval().requires_grad_(False)
 
 
 def whats(rows):

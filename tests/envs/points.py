@@ -13,19 +13,29 @@ class PointEnv(MovingTargetEnv):
 
     flags = ("met", "gone")
 
-    def __init__(self, num_envs: int = 2, *, speed: float = 0.05, scene: str | None = None, **series: object) -> None:
-        super().__init__(num_envs, state_size=3, action_size=3, **{"seed": 0, **series})
+    def __init__(
+        self,
+        num_envs: int = 2,
+        *,
+        speed: float = 0.05,
+        scene: str | None = None,
+        coordinates: int = 3,
+        **series: object,
+    ) -> None:
+        super().__init__(
+            num_envs, state_size=coordinates, action_size=coordinates, coordinates=coordinates, **{"seed": 0, **series}
+        )
         self.speed, self.scene_digest = speed, scene
-        self.tool_pos, self.target = torch.zeros(num_envs, 3), torch.zeros(num_envs, 3)
+        self.tool_pos, self.target = torch.zeros(2, num_envs, coordinates).unbind(0)
 
     def _start(self, rows: Tensor, episodes: Tensor) -> Tensor:
         self.tool_pos[rows] = 0.0
-        self.target[rows] = draw_uniform(episodes, 3, split=self.split, seed=self.seed).float()
+        self.target[rows] = draw_uniform(episodes, self.coordinates, split=self.split, seed=self.seed).float()
         return self.target[rows]
 
     def _advance(self, action: Tensor) -> Tensor:
         self.tool_pos = self.tool_pos + STRIDE * action.clamp(-1.0, 1.0)
-        self.target = self.target + torch.tensor([self.speed, 0.0, 0.0])
+        self.target = self.target + self.speed * torch.eye(self.coordinates)[0]
         return self.target
 
     def _robot(self) -> RobotReading:

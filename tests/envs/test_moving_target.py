@@ -6,6 +6,7 @@ from torchrl.envs.utils import check_env_specs
 
 from tests.envs.points import STRIDE, PointEnv
 from torchdyn_plan import keys
+from torchdyn_plan.envs import Sensor
 from torchdyn_plan.errors import InputError
 from torchdyn_plan.planners import ProportionalController, TargetPursuit
 
@@ -14,14 +15,17 @@ def pursuit(scene=None):
     return TargetPursuit(ProportionalController(gain=1.0 / STRIDE), scene=scene)
 
 
-@pytest.mark.parametrize("settings", [{}, {"static_target": True, "history": 5}, {"num_envs": 1}])
+@pytest.mark.parametrize(
+    "settings",
+    [{}, {"static_target": True, "history": 5}, {"num_envs": 1}, {"coordinates": 2, "goal_in_observation": True}],
+)
 def test_specs_hold(settings):
     check_env_specs(PointEnv(**settings))
 
 
 def test_a_robot_without_joints_shows_none_and_every_other_key_of_the_table():
     rollout = PointEnv(3, static_target=True).rollout(4)
-    sizes = {"A": 3, "H": 24, "S": 3}
+    sizes = {"D": 3, "A": 3, "H": 24, "S": 3}
     for key in keys.KEYS:
         joints = key.name in (keys.JOINT_POS, keys.JOINT_VEL)
         if joints:
@@ -29,6 +33,17 @@ def test_a_robot_without_joints_shows_none_and_every_other_key_of_the_table():
         elif key.writer == "env" or key.name in (keys.GOAL, keys.ACTION):
             shape = tuple(sizes[size] if isinstance(size, str) else size for size in key.shape)
             assert rollout[key.name].shape == (3, 4, *shape), key
+
+
+def test_in_a_plane_every_place_has_two_coordinates():
+    rollout = PointEnv(3, coordinates=2, control_step=0.1, sensor=Sensor(noise=0.01)).rollout(4)
+    sizes = {"D": 2, "A": 2, "H": 24, "S": 2, "M": rollout["measured_time"].shape[-1]}
+    for key in keys.KEYS:
+        if key.name in rollout.keys():  # noqa: SIM118
+            shape = tuple(sizes[size] if isinstance(size, str) else size for size in key.shape)
+            assert rollout[key.name].shape == (3, 4, *shape), key
+    with pytest.raises(InputError, match="coordinates must be in"):
+        PointEnv(coordinates=4)
 
 
 def test_any_flag_ends_an_episode_and_the_first_one_is_rewarded():

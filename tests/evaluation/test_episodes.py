@@ -177,7 +177,7 @@ def test_a_whole_episode_plans_at_exactly_the_papers_steps(truth):
     episode = int((~is_pocketed(SCENE, truth.future[:, 500])).int().argmax())
     env = TrapperEnv(1, split="dev", seed=0, num_threads=1)
     env.start_from(episode)
-    planner = DynamicPlanner(stand_still(), lambda history: history, StraightArrival())
+    planner = DynamicPlanner.paper(stand_still(), lambda history: history, StraightArrival())
     rollout = env.rollout(500, planner)[0]
     assert len(rollout) == 500
     planned = rollout["plan", "replanned"].nonzero().squeeze(-1).tolist()

@@ -11,4 +11,4 @@ def untrained(**parts):
     torch.manual_seed(0)
     # Narrower ones take kernels whose last bit depends on a row's place in the block.
     nets = Forecaster(hidden=64).eval(), ETANetwork(hidden=64).eval()
-    return DynamicPlanner(ik_planner(chunk=8), *nets, chunk=8, **parts).requires_grad_(False)
+    return DynamicPlanner.paper(ik_planner(chunk=8), *nets, chunk=8, **parts).requires_grad_(False)

@@ -174,11 +174,11 @@ def test_it_is_told_by_its_settings(model):
     ("make", "message"),
     [
         (lambda: ConstantVelocity(horizon=0), "horizon must be >= 1, got 0"),
-        (lambda: Ballistic(gravity=(0.0, 1.0)), r"gravity must be three numbers, got \(0.0, 1.0\)"),
+        (lambda: Ballistic(gravity=(1.0,)), r"gravity must be two or three numbers, got \(1.0,\)"),
         (lambda: Billiard(0.0), "half_extent must be >= 1e-09, got 0.0"),
         (lambda: Billiard(1.0, restitution=1.2), r"restitution must be in \[0.01, 1\], got 1.2"),
         (lambda: Billiard(1.0, gaps=[(0.5, 0.2)]), r"gaps must be pairs that rise within ±1, got \(0.5, 0.2\)"),
-        (lambda: ConstantVelocity().predict(torch.zeros(3, 24, 2)), "target_history must have shape"),
+        (lambda: ConstantVelocity().predict(torch.zeros(3, 24, 4)), "target_history must have shape"),
         (
             lambda: ConstantVelocity(tracked=True).predict(torch.zeros(3, 24, 3), torch.zeros(3, 3)),
             "target_covariance must have shape",

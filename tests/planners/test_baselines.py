@@ -60,7 +60,7 @@ def test_the_oracle_is_the_dynamic_planner_with_the_truth_as_forecast(batch):
     recording = start + velocity * torch.arange(100.0)[:, None]
     parts = {"schedule": SCHEDULE}
     oracle = oracle_trajectory(go_straight(), StraightArrival(), horizon=40, **parts)
-    dynamic = DynamicPlanner(go_straight(), Straight(horizon=40), StraightArrival(), **parts)
+    dynamic = DynamicPlanner.paper(go_straight(), Straight(horizon=40), StraightArrival(), **parts)
     a = observation(batch).exclude("target_history").set("target_future", recording)
     b = observation(batch)
     for step in range(5, 40):

@@ -42,7 +42,7 @@ def planner(name, *, for_inference=False):
     else:
         torch.manual_seed(0)
         networks = Forecaster(square_symmetry=True, half_extent=0.75, hidden=32).eval(), ETANetwork(hidden=32)
-        made = DynamicPlanner(ik_planner(), *networks, **PARTS[name]).requires_grad_(False)
+        made = DynamicPlanner.paper(ik_planner(), *networks, **PARTS[name]).requires_grad_(False)
     # What is compiled is made by the models themselves: so they are what it is compared with.
     return made.for_inference() if for_inference else made.train()
 

@@ -30,7 +30,7 @@ def make_planner(**parts):
     def arrival(robot_state, goal):
         return (goal - robot_state[..., -3:]).norm(dim=-1) / SPEED
 
-    return DynamicPlanner(go_straight(), Straight().path, arrival, **{"schedule": SCHEDULE, **parts})
+    return DynamicPlanner.paper(go_straight(), Straight().path, arrival, **{"schedule": SCHEDULE, **parts})
 
 
 def primed(env, planner):

@@ -116,14 +116,14 @@ def test_functions_may_stand_in_for_any_network():
     def steps(robot_state, goal):
         return (goal - robot_state[..., -3:]).norm(dim=-1) / 0.01
 
-    planner = DynamicPlanner(go_straight(), at_rest, steps, schedule=SCHEDULES[0])
+    planner = DynamicPlanner.paper(go_straight(), at_rest, steps, schedule=SCHEDULES[0])
     assert isinstance(planner.forecaster, FunctionForecast)
     assert isinstance(planner.eta, FunctionArrival)
     td = world(3).run(planner, 4)[-1]
     torch.testing.assert_close(td["goal"], td["target_pos"])
     module = nn.Identity()
     assert "function" in dict(DynamicPlanner(go_straight(), module, steps).forecaster.named_children())
-    for bad in ({"forecaster": 3}, {"eta": None}, {"static": "ik"}):
+    for bad in ({"forecaster": 3}, {"eta": 3}, {"static": "ik"}):
         with pytest.raises(InputError, match=f"{next(iter(bad))} must be"):
             make_planner().with_parts(**bad)
 

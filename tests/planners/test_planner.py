@@ -25,7 +25,7 @@ pytestmark = pytest.mark.filterwarnings(NO_MEMORY)
 
 def test_plans_at_the_papers_steps_with_two_arrival_passes_each():
     eta, forecaster = StraightArrival(), Straight()
-    planner = DynamicPlanner(go_straight(), forecaster, eta)
+    planner = DynamicPlanner.paper(go_straight(), forecaster, eta)
     td = observation((2,))
     for step in range(500):
         td["step_count"].fill_(step)
@@ -117,7 +117,7 @@ def test_networks_are_found_as_parameters_and_a_callable_may_stand_in_for_any_pa
     def stay(td):
         return td.set("action", torch.zeros_like(td["tool_pos"]))
 
-    simple = DynamicPlanner(stay, lambda history: history, StraightArrival(), schedule=SCHEDULE)
+    simple = DynamicPlanner.paper(stay, lambda history: history, StraightArrival(), schedule=SCHEDULE)
     assert not simple(observation((2,), step=3))["action"].any()
 
 

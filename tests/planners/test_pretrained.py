@@ -77,7 +77,7 @@ def test_a_planner_by_name_is_the_one_put_together_from_its_parts(shipped, due):
     forecaster, eta = shipped[1]
     planner = DynamicPlanner.from_pretrained("trapper-ik", static=ik_planner(chunk=4), chunk=4)
     parts = {"maneuver": GoToAndKeep.of(SCENE), "chunk": 4}
-    by_hand = DynamicPlanner(ik_planner(chunk=4), forecaster, eta, **parts).eval().requires_grad_(False)
+    by_hand = DynamicPlanner.paper(ik_planner(chunk=4), forecaster, eta, **parts).eval().requires_grad_(False)
     with torch.no_grad():
         one, other = planner(due.clone()), by_hand(due.clone())
     assert one["plan", "replanned"].all()
@@ -93,7 +93,9 @@ def test_a_learned_policy_comes_with_its_own_arrival_times(shipped, due):
     eta.save_pretrained(shipped[0] / "eta-trapper-rl-nearest.safetensors")
     planner = DynamicPlanner.from_pretrained("trapper-rl")
     policy = PolicyPlanner(actor.eval(), approach=BoxApproach.of(SCENE))
-    by_hand = DynamicPlanner(policy, shipped[1][0], eta, maneuver=GoToAndKeep.of(SCENE)).eval().requires_grad_(False)
+    by_hand = (
+        DynamicPlanner.paper(policy, shipped[1][0], eta, maneuver=GoToAndKeep.of(SCENE)).eval().requires_grad_(False)
+    )
     with torch.no_grad():
         one, other = planner(due.clone()), by_hand(due.clone())
     assert_same(one, other)
@@ -144,7 +146,7 @@ def test_one_that_waits_and_drops_comes_with_its_spread(shipped, due):
     planner = DynamicPlanner.from_pretrained("trapper-ik-wait_and_drop", chunk=4)
     assert isinstance(planner.forecaster, SpreadForecaster)
     assert (planner.search, planner.maneuver) == (waiting_search(SCENE), WaitAndDrop.of(SCENE))
-    assert (planner.schedule, planner.chunk) == (ReplanSchedule.every(5), 4)
+    assert (planner.schedule, planner.chunk) == (ReplanSchedule.every(5, first_step=13), 4)
     with torch.no_grad():
         td = planner(due.clone())
     assert bool(td["goal"].isfinite().all())
@@ -210,7 +212,7 @@ def networks():
 def trapper_planner(**parts):
     found = networks()
     made = {"static": ik_planner(), "forecaster": found["forecaster"], "eta": found["eta"]}
-    return DynamicPlanner(**(made | parts)).eval().requires_grad_(False)
+    return DynamicPlanner.paper(**(made | parts)).eval().requires_grad_(False)
 
 
 PLANNERS = {
@@ -222,7 +224,7 @@ PLANNERS = {
     "waiting": {
         "forecaster": networks()["spread"],
         "search": waiting_search(SCENE),
-        "schedule": ReplanSchedule.every(5),
+        "schedule": ReplanSchedule.every(5, first_step=13),
         "maneuver": WaitAndDrop.of(SCENE),
         "lost": POCKETED,
         "scene": SCENE.digest(),

@@ -119,7 +119,7 @@ def test_a_fault_from_the_start_to_the_end_leaves_the_arm_at_rest():
 @pytest.mark.parametrize("garbage", [NAN, INF, 1e30, -2 * FARTHEST])
 def test_garbage_from_the_forecaster_holds_its_rows_until_it_ends(garbage):
     forecaster = Mocked()
-    planner = DynamicPlanner(go_straight(), forecaster, StraightArrival(), schedule=SCHEDULE)
+    planner = DynamicPlanner.paper(go_straight(), forecaster, StraightArrival(), schedule=SCHEDULE)
     td = calm(4)
     td["target_history"][:2, :, 1] -= 2.0
     td["target_pos"] = td["target_history"][:, -1]

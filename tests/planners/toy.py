@@ -6,7 +6,7 @@ from torchrl.data import Binary, Bounded, Composite, Unbounded
 from torchrl.envs import EnvBase
 
 from torchdyn_plan.nets import Arrival, ArrivalModel, Forecast, ForecastModel
-from torchdyn_plan.planners import CallablePlanner, DynamicPlanner, ReplanSchedule
+from torchdyn_plan.planners import CallablePlanner, CornerSearch, DynamicPlanner, ReplanSchedule
 from torchdyn_plan.planners.planner import observe
 
 HISTORY, SPEED = 6, 0.01
@@ -52,7 +52,7 @@ def go_straight():
 
 
 def make_planner(**settings):
-    settings = {"schedule": SCHEDULE, **settings}
+    settings = {"schedule": SCHEDULE, "search": CornerSearch(), **settings}
     return DynamicPlanner(go_straight(), Straight(), StraightArrival(), **settings)
 
 

@@ -70,6 +70,7 @@ def test_a_description_says_what_was_asked_for(tmp_path):
         "num_threads": 1,
         "static": "straight",
         "weights": None,
+        "tracks": None,
     }
 
 

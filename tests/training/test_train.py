@@ -31,7 +31,7 @@ def few_rows(monkeypatch):
 
 def test_networks_are_those_that_the_task_has_data_and_recipes_for():
     assert networks(TASK) == ("forecaster", "spread", "eta", "nearest_eta", "policy")
-    assert networks(replace(TASK, record_paths=None)) == ("eta", "nearest_eta", "policy")
+    assert networks(replace(TASK, record_paths=None)) == networks(TASK)
     assert networks(replace(TASK, fitting=None)) == ("policy",)
     assert networks(load_task("fetch_reach"))[-2:] == ("policy", "dher")
 

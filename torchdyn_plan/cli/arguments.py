@@ -96,6 +96,7 @@ class CollectArguments(Arguments):
     """Folder for the shards of data; runs/data/TASK-STATIC when not given."""
     weights: Path | None = None
     """Of a static planner that is a policy: a file, or a folder of its training; the one that ships when not given."""
+    tracks: Path | None = None
     episodes: int = 20000
     """Number of targets, or of sequences of runs of the static planner."""
     seed: int = 0

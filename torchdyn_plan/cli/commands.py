@@ -93,10 +93,16 @@ def sweep(task: Task, arguments: SweepArguments) -> None:
 def collect(task: Task, arguments: CollectArguments) -> None:
     """Gather the data."""
     from torchdyn_plan.files import check_writable_folder
-    from torchdyn_plan.training.collect import collect
+    from torchdyn_plan.training.collect import collect, collect_tracks
 
     assert arguments.out is not None
+    if arguments.tracks is not None and arguments.what != "paths":
+        raise InputError(f"--from is of paths, not of {arguments.what}")
     check_writable_folder(arguments.out)
+    if arguments.tracks is not None:
+        count = collect_tracks(task, arguments.tracks, arguments.out, seed=arguments.seed)
+        say(f"{count} tracks in control steps of {task.control_step:g} s, written to {arguments.out}")
+        return
 
     collect(
         task,

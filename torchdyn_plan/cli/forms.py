@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 import typing
 from collections.abc import Iterable, Sequence
+from pathlib import Path
 from typing import Any
 
 from torchdyn_plan.cli.arguments import (
@@ -30,6 +31,12 @@ FITTED = {
     "nearest_eta": "The same as the paper has it: times until the robot is as near as it can come, and no *never*.",
 }
 """Networks that are fitted to data, and what ``--help`` says of them."""
+
+
+TRACKS = (
+    "File of recorded tracks to take for paths, .csv, .parquet, .npy or .npz: time [s], x, y and z [m], track. "
+    "Nothing is simulated then."
+)
 
 
 def check_words(words: Sequence[str]) -> None:
@@ -72,6 +79,7 @@ def command_forms(task: Task, named: str) -> dict[str, type[Arguments]]:
             **_task_options(task, named),
             what=_option(str, "Which data.", choices=("paths", "arrivals"), positional=True),
             static=_static_option(task, "Static planner whose arrivals are measured."),
+            tracks=_option(Path | None, TRACKS, default=None, name="from"),
         ),
     }
 
@@ -163,15 +171,21 @@ def _task_options(task: Task, named: str) -> dict[str, Any]:
 
 
 def _option(
-    kind: Any, text: str, *, choices: Iterable[Any] = (), default: Any = dataclasses.MISSING, positional: bool = False
+    kind: Any,
+    text: str,
+    *,
+    choices: Iterable[Any] = (),
+    default: Any = dataclasses.MISSING,
+    positional: bool = False,
+    name: str | None = None,
 ) -> tuple[Any, Any]:
-    """Type and field of an option, with what ``--help`` says of it."""
+    """Type and field of an option, with what ``--help`` says of it; ``name`` is its own, if not the field's."""
     import tyro
 
     shown = "{" + ",".join(map(str, choices)) + "}" if choices else None
     if shown and kind == tuple[str, ...]:
         shown = f"[{shown} ...]"
-    marks: list[Any] = [tyro.conf.arg(help=text, metavar=shown)]
+    marks: list[Any] = [tyro.conf.arg(name=name, help=text, metavar=shown)]
     if positional:
         marks.append(tyro.conf.Positional)
     return typing.Annotated[(kind, *marks)], dataclasses.field(default=default)

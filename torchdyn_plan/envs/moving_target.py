@@ -15,7 +15,7 @@ from torchrl.data import Bounded, Composite, Unbounded
 from torchrl.envs import EnvBase
 
 from torchdyn_plan import keys
-from torchdyn_plan.checks import check_choice, check_finite, check_number, check_trailing_shape
+from torchdyn_plan.checks import POINT_SIZES, check_choice, check_finite, check_number, check_trailing_shape
 from torchdyn_plan.envs.episodes import SPLITS, somewhere
 from torchdyn_plan.envs.sensing import Sensed, Sensing
 from torchdyn_plan.envs.sensor import Sensor
@@ -36,7 +36,7 @@ class RobotReading(NamedTuple):
     """What N robots' sensors read, float32; the environment shows copies of these tensors."""
 
     tool_pos: Tensor
-    """``(N, 3)`` [m, world]."""
+    """``(N, D)`` [m, world]."""
     state: Tensor
     """``(N, S)``: what a policy and an arrival model read, the tool's place among it."""
     joint_pos: Tensor | None = None
@@ -71,6 +71,7 @@ class MovingTargetEnv(EnvBase):
         state_size: int,
         action_size: int,
         joints: int = 0,
+        coordinates: int = 3,
         static_target: bool = False,
         seed: int | None = None,
         split: str = "train",
@@ -90,14 +91,15 @@ class MovingTargetEnv(EnvBase):
             state_size: size S of the robot state.
             action_size: size A of an action, each entry within ±1.
             joints: number of the robot's joints.
+            coordinates: D of every place, 2 in a plane or 3 in space.
             static_target: the target rests, and `goal` says where.
             seed: which series of episodes, from its first one; None for series 0 from somewhere far into it, another
                 place at every call, so that copies made without a seed play different episodes.
             split: ``train``, ``dev`` or ``test``: series that never share an episode.
             history: length H of `target_history`, in control steps.
             max_steps: control steps after which an episode is truncated.
-            goal_in_observation: `observation` ends with the target's place (3) [m, world] and, unless it rests, with
-                its last step (3) [m]: for scripts that show a policy nothing but `observation`.
+            goal_in_observation: `observation` ends with the target's place (D) [m, world] and, unless it rests, with
+                its last step (D) [m]: for scripts that show a policy nothing but `observation`.
             render_mode: ``rgb_array`` for pictures by `render`; None for none.
             on_bad_action: what becomes of an action that is no number: ``raise`` for an `InputError` before anything
                 moves, ``hold`` for an action of 0 in that row.
@@ -115,12 +117,14 @@ class MovingTargetEnv(EnvBase):
             raise InputError(f"{type(self).__name__}.flags must name at least what success is called")
         for name, value, minimum in (("num_envs", num_envs, 1), ("history", history, 2), ("max_steps", max_steps, 1)):
             check_number(name, value, minimum=minimum, integer=True)
+        check_number("coordinates", coordinates, minimum=POINT_SIZES[0], maximum=POINT_SIZES[-1], integer=True)
         check_choice("split", split, SPLITS)
         if render_mode is not None:
             check_choice("render_mode", render_mode, RENDER_MODES)
         check_choice("on_bad_action", on_bad_action, ON_BAD_ACTION)
         super().__init__(device=torch.device(device), batch_size=torch.Size([num_envs]))
         self.static_target, self.history, self.max_steps = static_target, history, max_steps
+        self.coordinates = coordinates
         self.split, self.goal_in_observation, self.render_mode = split, goal_in_observation, render_mode
         self.on_bad_action, self.control_step, self.sensor = on_bad_action, control_step, sensor
         self._process = os.getpid()
@@ -128,17 +132,18 @@ class MovingTargetEnv(EnvBase):
         self._episode = torch.zeros(num_envs, dtype=torch.int64)
         # TorchRL's StepCounter and CatFrames would do the next two, at several times the cost of a step.
         self._steps = torch.zeros(num_envs, dtype=torch.int64)
-        self._trace = torch.zeros(num_envs, history, 3)
+        self._trace = torch.zeros(num_envs, history, coordinates)
         self._sensing = self._make_sensing()
         if self._sensing is not None:
             self._held_trace, self._sensed = self._trace.clone(), self._sensing.nothing()
-        shown = 0 if not goal_in_observation else 3 if static_target else 6
+        shown = 0 if not goal_in_observation else coordinates if static_target else 2 * coordinates
         self.observation_spec = observation_spec(
             num_envs,
             joints=joints,
             state_size=state_size,
             observation_size=state_size + shown,
             history=history,
+            coordinates=coordinates,
             flags=self.flags,
             static_target=static_target,
             measurements=0 if self._sensing is None else self._sensing.slots,
@@ -160,15 +165,21 @@ class MovingTargetEnv(EnvBase):
             raise InputError("sensor must be None with static_target: a goal that rests is told, and not measured")
         if self.control_step is None:
             raise InputError(f"{type(self).__name__} needs its control_step [s] for a sensor, got None")
-        return Sensing(sensor, self.num_envs, control_step=self.control_step, max_steps=self.max_steps)
+        return Sensing(
+            sensor,
+            self.num_envs,
+            coordinates=self.coordinates,
+            control_step=self.control_step,
+            max_steps=self.max_steps,
+        )
 
     @abstractmethod
     def _start(self, rows: Tensor, episodes: Tensor) -> Tensor:
-        """Start ``episodes`` (M,) in ``rows`` (M,); returns where their targets are, ``(M, 3)`` float32 [m, world]."""
+        """Start ``episodes`` (M,) in ``rows`` (M,); returns where their targets are, ``(M, D)`` float32 [m, world]."""
 
     @abstractmethod
     def _advance(self, action: Tensor) -> Tensor:
-        """Let a control step pass under ``action`` (N, A); returns where targets are then, ``(N, 3)`` float32 [m]."""
+        """Let a control step pass under ``action`` (N, A); returns where targets are then, ``(N, D)`` float32 [m]."""
 
     @abstractmethod
     def _robot(self) -> RobotReading:
@@ -179,7 +190,7 @@ class MovingTargetEnv(EnvBase):
         """What has happened, bool ``(N,)`` for each of `flags`."""
 
     def true_future(self, rows: Tensor, steps: int) -> Tensor:
-        """Where the targets of ``rows`` (M,) go from now on if the robots stand still: ``(M, steps, 3)`` [m, world].
+        """Where the targets of ``rows`` (M,) go from now on if the robots stand still: ``(M, steps, D)`` [m, world].
 
         Entry k is k + 1 control steps ahead. It is simulated from the present state, on the CPU.
 
@@ -202,7 +213,7 @@ class MovingTargetEnv(EnvBase):
 
     @property
     def target_pos(self) -> Tensor:
-        """Where targets are now, ``(N, 3)`` [m, world]."""
+        """Where targets are now, ``(N, D)`` [m, world]."""
         return self._trace[:, -1]
 
     @property
@@ -339,7 +350,7 @@ class MovingTargetEnv(EnvBase):
         return action
 
     def _see(self, target: Tensor) -> None:
-        """Add ``target`` (N, 3) float32 to the history, and count a step."""
+        """Add ``target`` (N, D) float32 to the history, and count a step."""
         self._steps += 1
         self._trace = torch.cat([self._trace[:, 1:], target.unsqueeze(1)], dim=1)
         if self._sensing is not None:
@@ -347,7 +358,7 @@ class MovingTargetEnv(EnvBase):
             self._held_trace = torch.cat([self._held_trace[:, 1:], self._sensed.held.unsqueeze(1)], dim=1)
 
     def _start_sensing(self, sensing: Sensing, rows: Tensor, episodes: Tensor, place: Tensor) -> None:
-        """Show ``rows`` (M,) the first measurements of ``episodes`` (M,), whose targets are at ``place`` (M, 3)."""
+        """Show ``rows`` (M,) the first measurements of ``episodes`` (M,), whose targets are at ``place`` (M, D)."""
         first = sensing.start(rows, episodes, place, split=self.split, seed=self.seed)
         self._held_trace[rows] = first.held.unsqueeze(1)
         self._sensed = Sensed(*(old.index_copy(0, rows, new) for old, new in zip(self._sensed, first, strict=True)))

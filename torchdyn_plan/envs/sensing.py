@@ -24,9 +24,9 @@ class Sensed(NamedTuple):
     """What is seen of N targets at one control step."""
 
     held: Tensor
-    """``(N, 3)`` float32, the newest measurement that is there [m, world]."""
+    """``(N, D)`` float32, the newest measurement that is there [m, world]."""
     pos: Tensor
-    """``(N, M, 3)`` float32 measurements that have come with this step [m, world]; NaN in slots that stay empty."""
+    """``(N, M, D)`` float32 measurements that have come with this step [m, world]; NaN in slots that stay empty."""
     time: Tensor
     """``(N, M)`` float32, when they were taken [s since the reset]; NaN in slots that stay empty."""
 
@@ -38,27 +38,34 @@ class Sensing:
     episode): results do not depend on how many environments there are.
     """
 
-    def __init__(self, sensor: Sensor, num_envs: int, *, control_step: float, max_steps: int) -> None:
-        """Lay out the memory for episodes of up to ``max_steps`` control steps of ``control_step`` [s]."""
+    def __init__(
+        self, sensor: Sensor, num_envs: int, *, coordinates: int = 3, control_step: float, max_steps: int
+    ) -> None:
+        """Lay out the memory for episodes of up to ``max_steps`` control steps of ``control_step`` [s].
+
+        Places have ``coordinates`` D.
+        """
         self.sensor, self.control_step = sensor, control_step
         self.slots = sensor.slots(control_step)
         self._period = control_step if sensor.rate is None else 1.0 / sensor.rate
         self._count = math.floor(max_steps * control_step / self._period + ROUNDING) + 1
         shape = num_envs, self._count
         self._time = torch.zeros(shape, dtype=torch.float64)
-        self._error = torch.zeros(*shape, 3)
-        self._value = torch.zeros(*shape, 3)
+        self._error = torch.zeros(*shape, coordinates)
+        self._value = torch.zeros(*shape, coordinates)
         self._taken_step = torch.zeros(shape, dtype=torch.int64)
         self._seen_step = torch.zeros(shape, dtype=torch.int64)
-        self._held = torch.zeros(num_envs, 3)
+        self._held = torch.zeros(num_envs, coordinates)
 
     def nothing(self) -> Sensed:
         """What is seen of targets of which nothing has been measured."""
         shape = len(self._held), self.slots
-        return Sensed(self._held.clone(), torch.full((*shape, 3), torch.nan), torch.full(shape, torch.nan))
+        return Sensed(
+            self._held.clone(), torch.full((*shape, self._held.shape[-1]), torch.nan), torch.full(shape, torch.nan)
+        )
 
     def start(self, rows: Tensor, episodes: Tensor, place: Tensor, *, split: str, seed: int) -> Sensed:
-        """Start ``episodes`` (R,) in ``rows`` (R,); returns what is seen at once of targets at ``place`` (R, 3)."""
+        """Start ``episodes`` (R,) in ``rows`` (R,); returns what is seen at once of targets at ``place`` (R, D)."""
         for row, episode in zip(rows.tolist(), episodes.tolist(), strict=True):
             self._draw(row, episode_random(split, seed, episode, STREAM))
         # Jitter may take more than one measurement at the start.
@@ -73,7 +80,7 @@ class Sensing:
     def _draw(self, row: int, draw: np.random.Generator) -> None:
         """Draw the moments, errors and losses of all measurements of the episode that starts in ``row``."""
         sensor, count = self.sensor, self._count
-        self._error[row] = torch.from_numpy(sensor.noise * draw.standard_normal((count, 3))).float()
+        self._error[row] = torch.from_numpy(sensor.noise * draw.standard_normal((count, self._held.shape[-1]))).float()
         moment = self._period * np.arange(count) + sensor.jitter * draw.standard_normal(count)
         lost = torch.from_numpy(draw.uniform(size=count) < sensor.dropout)
         moment[0], lost[0] = 0.0, False
@@ -83,7 +90,7 @@ class Sensing:
         self._seen_step[row, 0] = 0
 
     def see(self, step_count: Tensor, before: Tensor, now: Tensor) -> Sensed:
-        """What is seen at control steps ``step_count`` (N,) of targets that were ``before`` and are ``now`` (N, 3)."""
+        """What is seen at control steps ``step_count`` (N,) of targets that were ``before`` and are ``now`` (N, D)."""
         step = step_count.unsqueeze(-1)
         rows, number = ((self._taken_step == step) & (step > 0)).nonzero(as_tuple=True)
         # A measurement between two control steps is of a place between the two.
@@ -97,7 +104,7 @@ class Sensing:
         """The measurements that come now, ``(N, count)`` bool, the last `slots` of each row."""
         left = comes.long().flip(-1).cumsum(-1).flip(-1)
         rows, number = (comes & (left <= self.slots)).nonzero(as_tuple=True)
-        pos = torch.full((len(comes), self.slots, 3), torch.nan)
+        pos = torch.full((len(comes), self.slots, self._held.shape[-1]), torch.nan)
         time = torch.full((len(comes), self.slots), torch.nan)
         slot = self.slots - left[rows, number]
         pos[rows, slot], time[rows, slot] = self._value[rows, number], self._time[rows, number].float()

@@ -22,6 +22,7 @@ def observation_spec(
     state_size: int,
     observation_size: int,
     history: int,
+    coordinates: int,
     flags: tuple[str, ...],
     static_target: bool,
     measurements: int = 0,
@@ -31,21 +32,21 @@ def observation_spec(
     ``measurements`` is how many can come at a step, 0 where the target is seen exactly.
     """
     vectors: dict[str, tuple[int, ...]] = {
-        keys.TOOL_POS: (3,),
-        keys.TARGET_POS: (3,),
-        keys.TARGET_HISTORY: (history, 3),
+        keys.TOOL_POS: (coordinates,),
+        keys.TARGET_POS: (coordinates,),
+        keys.TARGET_HISTORY: (history, coordinates),
         keys.ROBOT_STATE: (state_size,),
         keys.OBSERVATION: (observation_size,),
-        keys.ACHIEVED_GOAL: (3,),
-        keys.DESIRED_GOAL: (3,),
+        keys.ACHIEVED_GOAL: (coordinates,),
+        keys.DESIRED_GOAL: (coordinates,),
     }
     if joints:
         vectors |= {keys.JOINT_POS: (joints,), keys.JOINT_VEL: (joints,)}
     if static_target:
-        vectors[keys.GOAL] = (3,)
+        vectors[keys.GOAL] = (coordinates,)
     if measurements:
-        vectors[keys.MEASURED_POS], vectors[keys.MEASURED_TIME] = (measurements, 3), (measurements,)
-        vectors[keys.TRUE_TARGET_POS] = (3,)
+        vectors[keys.MEASURED_POS], vectors[keys.MEASURED_TIME] = (measurements, coordinates), (measurements,)
+        vectors[keys.TRUE_TARGET_POS] = (coordinates,)
     specs: dict[str, Any] = {key: Unbounded(torch.Size((num_envs, *shape))) for key, shape in vectors.items()}
     for key in (keys.HISTORY_LENGTH, keys.EPISODE):
         specs[key] = Unbounded(torch.Size((num_envs,)), dtype=torch.int64)

@@ -113,7 +113,7 @@ class ShownTruth:
     """What planners that know the truth are shown of it: recordings, and how things go on from the present state."""
 
     def __init__(self, planner: Planner, env: MovingTargetEnv, recorded: Tensor | None) -> None:
-        """Show ``planner`` in ``env`` what it reads of the truth, by ``recorded`` (E, T, 3) paths; nothing for none."""
+        """Show ``planner`` in ``env`` what it reads of the truth, by ``recorded`` (E, T, D) paths; nothing for none."""
         read = getattr(planner, "in_keys", ())
         known = recorded if recorded is not None and recorded.shape[1] else None
         self.env, self.recorded = env, known
@@ -133,7 +133,7 @@ class ShownTruth:
             tensordict[keys.TRUE_FUTURE] = self._future(episode, tensordict)
 
     def _future(self, episode: Tensor, seen: TensorDictBase) -> Tensor:
-        """Where targets will be at the next steps, ``(N, F, 3)``: F is how far recordings go beyond an episode."""
+        """Where targets will be at the next steps, ``(N, F, D)``: F is how far recordings go beyond an episode."""
         assert self.recorded is not None
         new, step = episode != self._episode, seen[keys.STEP_COUNT].squeeze(-1)
         if self._path is None:
@@ -148,17 +148,17 @@ class ShownTruth:
             # As long as the row that has most to come needs it.
             steps = length - 1 - int(step[stale].min())
             since = torch.arange(length) - step[stale].unsqueeze(-1) - 1
-            index = since.clamp(0, steps - 1).unsqueeze(-1).expand(-1, -1, 3)
+            index = since.clamp(0, steps - 1).unsqueeze(-1).expand(-1, -1, self._path.shape[-1])
             renewed = self.env.true_future(stale, steps).gather(1, index)
             self._path[stale] = torch.where(since.unsqueeze(-1) >= 0, renewed, self._path[stale])
         ahead = torch.arange(1, length - self.env.max_steps)
-        return self._path.gather(1, (step.unsqueeze(-1) + ahead).unsqueeze(-1).expand(-1, -1, 3))
+        return self._path.gather(1, (step.unsqueeze(-1) + ahead).unsqueeze(-1).expand(-1, -1, self._path.shape[-1]))
 
 
 def play(planner: Planner, env: MovingTargetEnv, log: EpisodeLog, future: Tensor | None = None) -> Iterator[int]:
     """Step all environments once for each value taken, which is the number of ``log``'s episodes that the step ended.
 
-    ``future`` (E, T, 3) is the recorded truth for planners that read ``target_future`` or ``true_future``; None or T =
+    ``future`` (E, T, D) is the recorded truth for planners that read ``target_future`` or ``true_future``; None or T =
     0 for none.
     """
     truth, tensordict = ShownTruth(planner, env, future), env.reset()
@@ -177,7 +177,7 @@ def play_all(
         planner: any planner for a moving target.
         env: what it acts in, at its first episode.
         log: of the episodes to come.
-        future: ``(E, T, 3)`` recorded truth, as `play` says.
+        future: ``(E, T, D)`` recorded truth, as `play` says.
         name: shown beside the progress bar.
         progress: show the bar.
 

@@ -15,11 +15,11 @@ class Trace(NamedTuple):
     """Records of R episodes at control steps 0 … T-1; what lies beyond an episode's end is arbitrary."""
 
     tool_pos: Tensor
-    """``(R, T, 3)`` [m, world]"""
+    """``(R, T, D)`` [m, world]"""
     target_pos: Tensor
-    """``(R, T, 3)`` [m, world]"""
+    """``(R, T, D)`` [m, world]"""
     goal: Tensor
-    """``(R, T, 3)`` of the plan in force; of the static planner, if there are no plans [m, world]."""
+    """``(R, T, D)`` of the plan in force; of the static planner, if there are no plans [m, world]."""
     arrival_steps: Tensor
     """``(R, T)`` int64 control steps to the meeting."""
     planned: Tensor
@@ -32,8 +32,8 @@ class Trace(NamedTuple):
     """``(R, T)`` of the fastest joint [rad/s]; 0 of a robot that shows no joints."""
 
 
-COLUMNS = 13
-"""Numbers of a record at each step: those of `Trace` but the length."""
+PLACES, NUMBERS = 3, 4
+"""Places and single numbers of a record at each step: those of `Trace` but the length."""
 
 
 class TraceLog:
@@ -42,7 +42,7 @@ class TraceLog:
     def __init__(self, max_steps: int) -> None:
         """Room for episodes of up to ``max_steps`` control steps."""
         self._max_steps = max_steps
-        self._record: Tensor = torch.empty(0, max_steps + 1, COLUMNS)
+        self._record: Tensor = torch.empty(0, max_steps + 1, 0)
         self._ended: list[Tensor] = []
         self._lengths: list[Tensor] = []
 
@@ -51,7 +51,7 @@ class TraceLog:
         tool_pos: Tensor = stepped.get(keys.TOOL_POS)
         step: Tensor = stepped.get(keys.STEP_COUNT).squeeze(-1)
         if len(self._record) != len(step):
-            self._record = torch.empty(len(step), self._max_steps + 1, COLUMNS)
+            self._record = torch.empty(len(step), self._max_steps + 1, PLACES * tool_pos.shape[-1] + NUMBERS)
             self._rows = torch.arange(len(step))
         plan = stepped.get(keys.PLAN, None)
         if plan is None or plan.get("replanned", None) is None:
@@ -84,7 +84,7 @@ class TraceLog:
 
 
 def _shown(observed: TensorDictBase) -> list[Tensor]:
-    """What an environment shows: where robots and targets are, (N, 3) each, and the fastest joint's speed (N, 1)."""
+    """What an environment shows: where robots and targets are, (N, D) each, and the fastest joint's speed (N, 1)."""
     tool_pos: Tensor = observed.get(keys.TOOL_POS)
     joint_vel = observed.get(keys.JOINT_VEL, None)
     speed = torch.zeros_like(tool_pos[:, :1]) if joint_vel is None else joint_vel.abs().amax(-1, keepdim=True)
@@ -92,12 +92,13 @@ def _shown(observed: TensorDictBase) -> list[Tensor]:
 
 
 def true_target(tensordict: TensorDictBase) -> Tensor:
-    """Where targets are, ``(*B, 3)`` [m, world], whatever a sensor makes of it."""
+    """Where targets are, ``(*B, D)`` [m, world], whatever a sensor makes of it."""
     truth = tensordict.get(keys.TRUE_TARGET_POS, None)
     return tensordict[keys.TARGET_POS] if truth is None else truth
 
 
 def _split(record: Tensor, length: Tensor) -> Trace:
-    tool_pos, target_pos, *others = record.split([3, 3, 1, 3, 1, 1, 1], dim=-1)
+    size = (record.shape[-1] - NUMBERS) // PLACES
+    tool_pos, target_pos, *others = record.split([size, size, 1, size, 1, 1, 1], dim=-1)
     speed, goal, arrival, planned, reachable = (others[0].squeeze(-1), others[1], *(o.squeeze(-1) for o in others[2:]))
     return Trace(tool_pos, target_pos, goal, arrival.long(), planned > 0, reachable > 0, length, speed)

@@ -7,6 +7,7 @@ from torchdyn_plan.nets.distributions import ESTIMATORS, Arrival, Spread
 from torchdyn_plan.nets.eta import ETAConfig, ETANetwork
 from torchdyn_plan.nets.forecast import DescribedForecast, Forecast, ForecastModel, FunctionForecast
 from torchdyn_plan.nets.forecaster import Forecaster, ForecasterConfig
+from torchdyn_plan.nets.point_arrival import PointArrival
 from torchdyn_plan.nets.policy import Actor, Critic, PolicyConfig
 from torchdyn_plan.nets.spread import SpreadConfig, SpreadForecaster, SpreadNetwork
 
@@ -31,6 +32,7 @@ __all__ = [
     "FunctionArrival",
     "FunctionForecast",
     "GoalJoints",
+    "PointArrival",
     "PolicyConfig",
     "SolvedJoints",
     "Spread",

@@ -11,7 +11,7 @@ import torch
 from torch import Tensor
 
 from torchdyn_plan import keys
-from torchdyn_plan.checks import check_number, check_trailing_shape
+from torchdyn_plan.checks import check_number, check_points, check_trailing_shape, check_vector
 from torchdyn_plan.errors import InputError
 from torchdyn_plan.nets.distributions import Spread
 from torchdyn_plan.nets.forecast import Forecast, ForecastModel
@@ -67,16 +67,16 @@ class AnalyticForecast(ForecastModel):
         """The forecast at moments ``time`` (F,) from now [s].
 
         Args:
-            history: ``(*B, H, 3)``, the target now last [m, world].
-            velocity: ``(*B, 3)`` over the last step [m/s, world].
+            history: ``(*B, H, D)``, the target now last [m, world].
+            velocity: ``(*B, D)`` over the last step [m/s, world].
             time: ``(F,)`` [s].
             deviation: ``(*B, F)`` standard deviation along each axis of what both lead to [m].
         """
 
     def predict(self, *seen: Tensor) -> Forecast:
-        """Path and spread after histories ``(*B, H, 3)`` [m, world], and of the history's type."""
+        """Path and spread after histories ``(*B, H, D)`` [m, world], and of the history's type."""
         history = seen[0]
-        check_trailing_shape(keys.TARGET_HISTORY, history, history.shape[-2] if history.ndim > 1 else 2, 3)
+        check_points(keys.TARGET_HISTORY, history, history.shape[-2] if history.ndim > 1 else 2)
         history = at_least_float32(history)
         place, velocity = history[..., -1, :], (history[..., -1, :] - history[..., -2, :]) / self.control_step
         time = self.control_step * torch.arange(1, self.horizon + 1, dtype=history.dtype, device=history.device)
@@ -115,13 +115,15 @@ class ConstantVelocity(AnalyticForecast):
 class Ballistic(AnalyticForecast):
     """The target flies: it falls with a constant acceleration, and nothing else acts on it."""
 
-    def __init__(self, *, gravity: tuple[float, float, float] = (0.0, 0.0, -9.81), **settings: Any) -> None:
-        """Fall with ``gravity`` [m/s², world]; ``settings`` are those of `AnalyticForecast`."""
+    def __init__(self, *, gravity: Sequence[float] = (0.0, 0.0, -9.81), **settings: Any) -> None:
+        """Fall with ``gravity``, D numbers [m/s², world]; ``settings`` are those of `AnalyticForecast`."""
         super().__init__(**settings)
-        self.gravity = _three("gravity", gravity)
+        self.gravity = check_vector("gravity", gravity)
 
     def follow(self, history: Tensor, velocity: Tensor, time: Tensor, deviation: Tensor) -> Forecast:
         """As of `AnalyticForecast`."""
+        if len(self.gravity) != history.shape[-1]:
+            raise InputError(f"gravity has {len(self.gravity)} numbers, but targets {history.shape[-1]} coordinates")
         falls, moment = time.new_tensor(self.gravity), time.unsqueeze(-1)
         # The velocity over the last step is that of half a step ago.
         speed = velocity + 0.5 * self.control_step * falls
@@ -197,7 +199,7 @@ class Billiard(AnalyticForecast):
         level, speed = history[..., -1:, :2], velocity[..., None, :2]
         rolled = self.roll(level, speed, self._slowed(history[..., :2], speed, time))
         wide = deviation.unsqueeze(-1) * rolled.share + self.restitution_deviation * rolled.since * rolled.bounces
-        height = history[..., -1:, 2:].expand(*rolled.place.shape[:-1], 1)
+        height = history[..., -1:, 2:].expand(*rolled.place.shape[:-1], history.shape[-1] - 2)
         falls = self._falls(rolled, wide, level)
         if falls is None:
             return Forecast(torch.cat([rolled.place, height], dim=-1), normal_spread(wide))
@@ -299,12 +301,3 @@ def normal_spread(deviation: Tensor, gone: Tensor | None = None) -> Spread:
     """The spread nearest to a normal distribution with ``deviation`` (*B, F, 2) along x and y [m]; surely not gone."""
     gone = torch.zeros_like(deviation[..., 0]) if gone is None else gone
     return Spread(MEDIAN * deviation, torch.full_like(deviation, SHAPE), gone)
-
-
-def _three(name: str, values: Sequence[float]) -> tuple[float, float, float]:
-    """``values`` as a tuple; raises `InputError` unless they are three numbers."""
-    if not isinstance(values, (tuple, list)) or len(values) != 3:
-        raise InputError(f"{name} must be three numbers, got {values!r}")
-    for value in values:
-        check_number(name, value)
-    return (float(values[0]), float(values[1]), float(values[2]))

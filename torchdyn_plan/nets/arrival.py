@@ -19,7 +19,7 @@ class ArrivalQuery(Protocol):
     """What a goal search asks: arrivals of robots in given states, at goals that come later."""
 
     def __call__(self, goal: Tensor, *, estimator: str = "mode") -> Arrival:
-        """Arrivals ``(*B, K)`` at goals ``(*B, K, 3)`` [m, world]."""
+        """Arrivals ``(*B, K)`` at goals ``(*B, K, D)`` [m, world]."""
         ...
 
 
@@ -28,7 +28,7 @@ class ArrivalModel(nn.Module, ABC):
 
     @abstractmethod
     def arrival(self, robot_state: Tensor, goal: Tensor, *, estimator: str = "mode") -> Arrival:
-        """Arrival ``(*B, K)`` at goals (*B, K, 3) [m, world] from robot states (*B, 1, S).
+        """Arrival ``(*B, K)`` at goals (*B, K, D) [m, world] from robot states (*B, 1, S).
 
         ``estimator`` says how a distribution over time becomes one number; a model that knows the time ignores it.
         """
@@ -46,7 +46,7 @@ class FunctionArrival(ArrivalModel):
     """A person's own function as an arrival model."""
 
     def __init__(self, function: Callable[[Tensor, Tensor], Any]) -> None:
-        """Wrap ``function``: robot states (*B, 1, S) and goals (*B, K, 3) to an `Arrival`, or to the steps alone."""
+        """Wrap ``function``: robot states (*B, 1, S) and goals (*B, K, D) to an `Arrival`, or to the steps alone."""
         super().__init__()
         self.function = function
 

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 import torch
 from torch import Tensor, nn
 
-from torchdyn_plan.checks import check_choice, check_number, network_input
+from torchdyn_plan.checks import POINT_SIZES, check_choice, check_number, network_input
 from torchdyn_plan.errors import InputError
 from torchdyn_plan.nets.arrival import ArrivalModel
 from torchdyn_plan.nets.distributions import ESTIMATORS, Arrival, without_never
@@ -44,10 +44,14 @@ class ETAConfig:
             raise InputError(f"never must be True or False, got {self.never!r}")
         object.__setattr__(self, "tool_slice", tuple(self.tool_slice))
         first, last = self.tool_slice
-        if not 0 <= first < last <= self.robot_state_size or last - first != 3:
-            raise InputError(
-                f"tool_slice must span 3 entries of a robot state of {self.robot_state_size}, got {self.tool_slice}"
-            )
+        if not 0 <= first < last <= self.robot_state_size or last - first not in POINT_SIZES:
+            spans = f"2 or 3 entries of a robot state of {self.robot_state_size}"
+            raise InputError(f"tool_slice must span {spans}, got {self.tool_slice}")
+
+    @property
+    def coordinates(self) -> int:
+        """Coordinates D of goals, those of the tool's place."""
+        return self.tool_slice[1] - self.tool_slice[0]
 
 
 class ETANetwork(Pretrained, Precise, ArrivalModel):
@@ -69,13 +73,13 @@ class ETANetwork(Pretrained, Precise, ArrivalModel):
         """Build the network from ``config``, or from the fields of `ETAConfig` given as keywords."""
         super().__init__()
         self.config = config = config or ETAConfig(**settings)
-        size, hidden = config.robot_state_size, config.hidden
+        size, hidden, wide = config.robot_state_size, config.hidden, 2 * config.coordinates + 2
         self.state_in = nn.Linear(size, hidden)
-        self.goal_in = nn.Linear(8, hidden, bias=False)
+        self.goal_in = nn.Linear(wide, hidden, bias=False)
         self.second = nn.Linear(hidden, hidden)
         self.third = nn.Linear(hidden, hidden)
         self.head = nn.Linear(hidden, config.bins + config.never)
-        for name, width in (("state", size), ("goal", 8)):
+        for name, width in (("state", size), ("goal", wide)):
             self.register_buffer(f"{name}_shift", torch.zeros(width))
             self.register_buffer(f"{name}_scale", torch.ones(width))
 
@@ -92,9 +96,9 @@ class ETANetwork(Pretrained, Precise, ArrivalModel):
         """Scores of the bins; the last one stands for *never arrives*, and is -∞ where the network has no such class.
 
         Args:
-            robot_state: ``(*B, S)``; its batch broadcasts against the goal's, ``(*B, 1, S)`` with ``(*B, K, 3)``
+            robot_state: ``(*B, S)``; its batch broadcasts against the goal's, ``(*B, 1, S)`` with ``(*B, K, D)``
                 serves K goals from one state.
-            goal: ``(*B, 3)`` places to reach [m, world].
+            goal: ``(*B, D)`` places to reach [m, world].
 
         Returns:
             ``(*B, bins + 1)`` logits, of the goals' type.
@@ -106,7 +110,7 @@ class ETANetwork(Pretrained, Precise, ArrivalModel):
             return without_autocast(self.forward, robot_state, goal)
         about: Any = {"like": self.state_scale, "owner": type(self).__name__}
         seen = network_input("robot_state", robot_state, self.config.robot_state_size, **about)
-        place, stored = network_input("goal", goal, 3, **about), self.head.weight.dtype
+        place, stored = network_input("goal", goal, self.config.coordinates, **about), self.head.weight.dtype
         state = torch.addcmul(self.state_shift, seen, self.state_scale)
         target = torch.addcmul(self.goal_shift, self._goal_features(seen, place), self.goal_scale)
         if state.dtype != stored:
@@ -118,7 +122,7 @@ class ETANetwork(Pretrained, Precise, ArrivalModel):
         return scores if scores.dtype == goal.dtype else scores.to(goal.dtype)
 
     def arrival(self, robot_state: Tensor, goal: Tensor, *, estimator: str = "mode") -> Arrival:
-        """Arrival time at ``goal (*B, 3)`` from ``robot_state (*B, S)``, batches broadcasting as in `forward`.
+        """Arrival time at ``goal (*B, D)`` from ``robot_state (*B, S)``, batches broadcasting as in `forward`.
 
         Args:
             robot_state: as in `forward`.
@@ -139,7 +143,7 @@ class ETANetwork(Pretrained, Precise, ArrivalModel):
         return InferenceETA(self)
 
     def _goal_features(self, robot_state: Tensor, goal: Tensor) -> Tensor:
-        """Goal, its offset from the tool, level and full distance: ``(*B, 8)``."""
+        """Goal, its offset from the tool, level and full distance: ``(*B, 2D + 2)``."""
         first, last = self.config.tool_slice
         offset = goal - robot_state[..., first:last]
         level = torch.linalg.vector_norm(offset[..., :2], dim=-1, keepdim=True)

@@ -19,7 +19,7 @@ class Forecast(NamedTuple):
     """Where the target will be."""
 
     path: Tensor
-    """``(*B, F, 3)`` [m, world]: entry e-1 is the position in e control steps."""
+    """``(*B, F, D)`` [m, world]: entry e-1 is the position in e control steps."""
     spread: Spread | None = None
     """How far the path may be off; None where nobody says."""
 
@@ -53,7 +53,7 @@ class FunctionForecast(ForecastModel):
     """A person's own function as a forecast model."""
 
     def __init__(self, function: Callable[..., Any], *, in_keys: Sequence[Any] = (keys.TARGET_HISTORY,)) -> None:
-        """Wrap ``function`` (an `nn.Module` too): the entries ``in_keys`` to a path (*B, F, 3) or a `Forecast`."""
+        """Wrap ``function`` (an `nn.Module` too): the entries ``in_keys`` to a path (*B, F, D) or a `Forecast`."""
         super().__init__()
         self.function, self.in_keys = function, tuple(in_keys)
 
@@ -77,7 +77,7 @@ class DescribedForecast(ForecastModel):
 
     @abstractmethod
     def forward(self, target_history: Tensor) -> Tensor:
-        """Positions at the next F control steps, ``(*B, F, 3)`` [m, world], after histories ``(*B, H, 3)``."""
+        """Positions at the next F control steps, ``(*B, F, D)`` [m, world], after histories ``(*B, H, D)``."""
 
     @abstractmethod
     def describe(self, target_history: Tensor) -> tuple[Tensor, Tensor, Tensor]:
@@ -86,3 +86,11 @@ class DescribedForecast(ForecastModel):
     def predict(self, *seen: Tensor) -> Forecast:
         """The path alone."""
         return Forecast(self(*seen))
+
+
+def in_plane(
+    forecast: Callable[[Tensor], tuple[Tensor, Tensor, Tensor]], target_history: Tensor
+) -> tuple[Tensor, Tensor, Tensor]:
+    """What ``forecast`` makes of histories (*B, H, 2) at height 0; of its path, the first entry, x and y alone."""
+    path, *others = forecast(nn.functional.pad(target_history, (0, 1)))
+    return path[..., :2], others[0], others[1]

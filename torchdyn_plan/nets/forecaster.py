@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import partial
 from typing import TYPE_CHECKING, Any
 
 import torch
@@ -10,7 +11,7 @@ from torch import Tensor, nn
 
 from torchdyn_plan.checks import check_count, check_number, network_input
 from torchdyn_plan.errors import InputError
-from torchdyn_plan.nets.forecast import DescribedForecast
+from torchdyn_plan.nets.forecast import DescribedForecast, in_plane
 from torchdyn_plan.nets.pretrained import Pretrained
 from torchdyn_plan.nets.reflection import reflect
 from torchdyn_plan.nets.symmetry import octant, square_symmetries
@@ -116,10 +117,11 @@ class Forecaster(Pretrained, Precise, DescribedForecast):
         """Positions at the next F control steps.
 
         Args:
-            target_history: ``(*B, H, 3)`` positions, oldest first; rows before the first sample repeat it [m, world].
+            target_history: ``(*B, H, D)`` positions, oldest first; rows before the first sample repeat it [m, world].
+                Targets in a plane, D = 2, are those at height 0.
 
         Returns:
-            ``(*B, F, 3)``, of the history's type: entry e-1 is the position in e steps [m, world].
+            ``(*B, F, D)``, of the history's type: entry e-1 is the position in e steps [m, world].
 
         Raises:
             InputError: the history has another shape, another device than the network, or holds a NaN.
@@ -152,6 +154,8 @@ class Forecaster(Pretrained, Precise, DescribedForecast):
         """Positions (*B, F, 3), hidden features (R, hidden) and whether x and y are exchanged in them (R,)."""
         if autocast_is_on():
             return without_autocast(self._forecast, target_history, reflected=reflected)
+        if target_history.shape[-1] == 2:
+            return in_plane(partial(self._forecast, reflected=reflected), target_history)
         config, about = self.config, {"like": self.steps_ahead, "owner": type(self).__name__}
         seen = network_input("target_history", target_history, config.history, 3, **about)
         history, turn = seen.reshape(-1, config.history, 3), None

@@ -19,7 +19,7 @@ from torch.func import debug_unwrap
 from torchdyn_plan.checks import check_choice, network_input
 from torchdyn_plan.nets.arrival import ArrivalModel, ArrivalQuery
 from torchdyn_plan.nets.distributions import ESTIMATORS, Arrival, Spread, arrival_moments, without_never
-from torchdyn_plan.nets.forecast import DescribedForecast, Forecast
+from torchdyn_plan.nets.forecast import DescribedForecast, Forecast, in_plane
 from torchdyn_plan.precision import Precise, autocast_is_on, in_type_of, without_autocast
 
 if TYPE_CHECKING:
@@ -139,12 +139,14 @@ class InferenceForecaster(Precise, DescribedForecast):
 
     def forward(self, target_history: Tensor) -> Tensor:
         """Positions at the next F control steps, ``(*B, F, 3)`` [m, world], as `Forecaster.forward` describes."""
-        network_input("target_history", target_history, self.config.history, 3, like=self.head_weight)
+        size = 2 if target_history.shape[-1:] == (2,) else 3
+        network_input("target_history", target_history, self.config.history, size, like=self.head_weight)
         return self._forecast(target_history)[0]
 
     def describe(self, target_history: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         """The same forecast, and what a spread is told by, as `Forecaster.describe` describes."""
-        network_input("target_history", target_history, self.config.history, 3, like=self.head_weight)
+        size = 2 if target_history.shape[-1:] == (2,) else 3
+        network_input("target_history", target_history, self.config.history, size, like=self.head_weight)
         forecast, hidden, turn = self._forecast(target_history)
         batch = target_history.shape[:-2]
         hidden = in_type_of(forecast, hidden).view(*batch, self.config.hidden)
@@ -155,6 +157,8 @@ class InferenceForecaster(Precise, DescribedForecast):
         config, like = self.config, self.head_weight
         if autocast_is_on():
             return without_autocast(self._forecast, target_history)
+        if target_history.shape[-1] == 2:
+            return in_plane(self._forecast, target_history)
         seen = target_history
         if seen.shape[-2:] != (config.history, 3) or seen.dtype != like.dtype or seen.device != like.device:
             seen = network_input("target_history", seen, config.history, 3, like=like, finite=False)
@@ -261,8 +265,8 @@ class InferenceETA(Precise, ArrivalModel):
         """Take the weights of ``network`` as they are now."""
         super().__init__()
         self.config = config = network.config
-        dtype, exact = network.head.weight.dtype, copy.deepcopy(network).double()
-        goal, offset, lengths = (exact.goal_in.weight * exact.goal_scale).split([3, 3, 2], dim=1)
+        dtype, exact, size = network.head.weight.dtype, copy.deepcopy(network).double(), config.coordinates
+        goal, offset, lengths = (exact.goal_in.weight * exact.goal_scale).split([size, size, 2], dim=1)
         bias = exact.state_in.bias + exact.state_in.weight @ exact.state_shift + exact.goal_in.weight @ exact.goal_shift
         state = (exact.state_in.weight * exact.state_scale).clone()
         state[:, slice(*config.tool_slice)] -= offset
@@ -271,7 +275,7 @@ class InferenceETA(Precise, ArrivalModel):
         for name in ("second", "third", "head"):
             layer = getattr(exact, name)
             hold_constants(self, dtype, **{f"{name}_weight": layer.weight.mT, f"{name}_bias": layer.bias})
-        hold_constants(self, dtype, square_sums=torch.tensor([[1.0, 1.0], [1.0, 1.0], [0.0, 1.0]]))
+        hold_constants(self, dtype, square_sums=torch.tensor([[1.0, 1.0], [1.0, 1.0], [0.0, 1.0]])[:size])
         hold_constants(
             self, dtype, moments=arrival_moments(exact.head.weight.new_empty(config.bins + 1), config.bin_width)
         )
@@ -297,7 +301,7 @@ class InferenceETA(Precise, ArrivalModel):
 
     def _check(self, robot_state: Tensor, goal: Tensor) -> None:
         """Raise `InputError` for an input that is none."""
-        network_input("goal", goal, 3, like=self.head_weight)
+        network_input("goal", goal, self.config.coordinates, like=self.head_weight)
         network_input("robot_state", robot_state, self.config.robot_state_size, like=self.head_weight)
 
     def _share(self, robot_state: Tensor) -> tuple[Tensor, Tensor]:

@@ -10,6 +10,7 @@ from torchdyn_plan.planners.baselines import (
 )
 from torchdyn_plan.planners.delivery import Delayed, Delivery
 from torchdyn_plan.planners.maneuver import GoTo, Maneuver
+from torchdyn_plan.planners.match_velocity import MatchPhase, MatchVelocity
 from torchdyn_plan.planners.observation import Observation
 from torchdyn_plan.planners.plan import Lost, LostBelow, Plan, PlanStatus
 from torchdyn_plan.planners.planner import DynamicPlanner, observe
@@ -29,6 +30,7 @@ from torchdyn_plan.planners.search import (
 from torchdyn_plan.planners.static.approach import Approach, StraightToGoal
 from torchdyn_plan.planners.static.callable import CallablePlanner
 from torchdyn_plan.planners.static.ik import IKPlanner
+from torchdyn_plan.planners.static.point import PointPlanner
 from torchdyn_plan.planners.static.policy import PolicyPlanner
 from torchdyn_plan.planners.static.proportional import ProportionalController
 from torchdyn_plan.planners.track import KalmanTrack, LeastSquaresTrack, Track, TrackState
@@ -53,10 +55,13 @@ __all__ = [
     "Lost",
     "LostBelow",
     "Maneuver",
+    "MatchPhase",
+    "MatchVelocity",
     "Meeting",
     "Observation",
     "Plan",
     "PlanStatus",
+    "PointPlanner",
     "PolicyPlanner",
     "ProportionalController",
     "RecordedFuture",

@@ -10,7 +10,7 @@ from tensordict import TensorDictBase
 from torch import Tensor
 
 from torchdyn_plan import keys
-from torchdyn_plan.checks import check_finite, check_number, check_trailing_shape
+from torchdyn_plan.checks import check_finite, check_number, check_points
 from torchdyn_plan.nets.arrival import ArrivalQuery
 from torchdyn_plan.nets.forecast import Forecast, ForecastModel
 from torchdyn_plan.planners.judging import act, judge_rows
@@ -22,22 +22,22 @@ from torchdyn_plan.planners.static.callable import TensorDictFunction
 
 
 class TargetPursuit(Remembering):
-    """Chases the target: at every step the goal is where the target is now (paper, Section IV-A.1)."""
+    """Runs after the target: at every step the goal is where the target is now (paper, Section IV-A.1)."""
 
     def __init__(self, static: StaticPlanner, *, scene: str | None = None) -> None:
-        """Chase with ``static``, a planner for a static goal; ``scene`` is the digest of its scene, if it has one."""
+        """Run with ``static``, a planner for a static goal; ``scene`` is the digest of its scene, if it has one."""
         super().__init__()
         self.static, self.scene = TensorDictFunction.wrap(static), scene
         self.in_keys = keys_read(self.static, keys.TARGET_POS)
         self.out_keys = keys_written(self.static, keys.GOAL, keys.ARRIVAL_STEPS)
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
-        """Write ``goal`` (*B, 3) [m, world] and ``arrival_steps`` (*B,), which is 0, and act.
+        """Write ``goal`` (*B, D) [m, world] and ``arrival_steps`` (*B,), which is 0, and act.
 
         Rows in which something that is read is no number get action 0.
         """
         target_pos = read(tensordict, keys.TARGET_POS, "TargetPursuit")
-        check_trailing_shape(keys.TARGET_POS, target_pos, 3)
+        check_points(keys.TARGET_POS, target_pos)
         bad = None
         if not are_sane(tensordict, self.in_keys):
             bad = judge_rows(tensordict, self.in_keys, target_pos.shape[:-1])
@@ -80,14 +80,14 @@ class RecordedFuture(ForecastModel):
         self.horizon = horizon
 
     def predict(self, *seen: Tensor) -> Forecast:
-        """Positions at steps t+1 … t+F, ``(*B, F, 3)``, of recordings ``(*B, T, 3)`` at steps t (*B,) [m, world]."""
+        """Positions at steps t+1 … t+F, ``(*B, F, D)``, of recordings ``(*B, T, D)`` at steps t (*B,) [m, world]."""
         target_future, step_count = seen
-        check_trailing_shape(keys.TARGET_FUTURE, target_future, target_future.shape[-2], 3)
+        check_points(keys.TARGET_FUTURE, target_future, _length(target_future))
         check_finite(keys.TARGET_FUTURE, target_future)
         ahead = torch.arange(1, self.horizon + 1, device=target_future.device)
         index = step_count.reshape(*target_future.shape[:-2], 1).long() + ahead
         index = index.clamp(max=target_future.shape[-2] - 1)
-        return Forecast(target_future.gather(-2, index.unsqueeze(-1).expand(*index.shape, 3)))
+        return Forecast(target_future.gather(-2, index.unsqueeze(-1).expand(*index.shape, target_future.shape[-1])))
 
     def part_settings(self) -> dict[str, Any]:
         """Arguments that make the same model."""
@@ -104,9 +104,9 @@ class TrueFuture(ForecastModel):
     in_keys = (keys.TRUE_FUTURE,)
 
     def predict(self, *seen: Tensor) -> Forecast:
-        """Positions at steps t+1 … t+F, ``(*B, F, 3)`` [m, world], as they are shown."""
+        """Positions at steps t+1 … t+F, ``(*B, F, D)`` [m, world], as they are shown."""
         (true_future,) = seen
-        check_trailing_shape(keys.TRUE_FUTURE, true_future, true_future.shape[-2], 3)
+        check_points(keys.TRUE_FUTURE, true_future, _length(true_future))
         check_finite(keys.TRUE_FUTURE, true_future)
         return Forecast(true_future)
 
@@ -115,23 +115,27 @@ class TrueFuture(ForecastModel):
         return {}
 
 
+def _length(path: Tensor) -> int:
+    """Places of ``path`` (*B, T, D), at least one."""
+    return path.shape[-2] if path.ndim > 1 else 1
+
+
 def oracle_trajectory(
     static: StaticPlanner, eta: Any, *, horizon: int = 300, recorded: bool = True, **parts: Any
 ) -> DynamicPlanner:
-    """The dynamic planner with the truth as its forecast (paper, IV-A.2).
+    """The paper's planner with the truth as its forecast (paper, IV-A.2).
 
     Args:
         static: as of `DynamicPlanner`, like ``eta`` and ``parts``.
         eta: tells how long ``static`` takes to a goal.
         horizon: as far as its search may look into a recording [control steps].
         recorded: the truth is what was recorded before the episode with the robot at its start, ``target_future``
-            (*B, T, 3), and no longer true once the target was touched; else ``true_future`` (*B, F, 3), which is.
+            (*B, T, D), and no longer true once the target was touched; else ``true_future`` (*B, F, D), which is.
         **parts: as of `DynamicPlanner`.
     """
-    return DynamicPlanner(static, RecordedFuture(horizon) if recorded else TrueFuture(), eta, **parts)
+    return DynamicPlanner.paper(static, RecordedFuture(horizon) if recorded else TrueFuture(), eta, **parts)
 
 
 def wait_at_end(static: StaticPlanner, forecaster: Any, eta: Any, **parts: Any) -> DynamicPlanner:
     """Goes to where the forecast ends and waits there: the other extreme beside pursuit (paper, III-B.4)."""
-    parts.setdefault("search", EndOfForecast())
-    return DynamicPlanner(static, forecaster, eta, **parts)
+    return DynamicPlanner.paper(static, forecaster, eta, **{"search": EndOfForecast(), **parts})

@@ -10,6 +10,7 @@ from tensordict import TensorDictBase
 from torch import Tensor
 
 from torchdyn_plan import keys
+from torchdyn_plan.checks import POINT_SIZES
 from torchdyn_plan.errors import InputError, TorchdynPlanError
 
 COUNTS = (keys.STEP_COUNT, keys.HISTORY_LENGTH, keys.EPISODE)
@@ -40,6 +41,7 @@ def find_fault(tensordict: Any, read: Sequence[Any], reader: str) -> Fault | Non
         sentence = f"{reader} writes to its tensordict, and this one is locked: give it a copy, tensordict.copy()"
         return Fault("tensordict", sentence)
     batch, sizes = tuple(tensordict.batch_size), {key.name: key.shape for key in keys.KEYS}
+    coordinates = _coordinates(tensordict)
     for key in read:
         value = tensordict.get(key, None) if isinstance(key, str) else None
         if value is None:
@@ -49,6 +51,8 @@ def find_fault(tensordict: Any, read: Sequence[Any], reader: str) -> Fault | Non
         if key in sizes and not value.is_floating_point() and (key not in COUNTS or value.is_complex()):
             return Fault(key, f"{key} must hold floating-point numbers, got {value.dtype}")
         expected, shape = sizes.get(key), tuple(value.shape)
+        if expected is not None:
+            expected = tuple(coordinates if size == "D" else size for size in expected)
         if expected is not None and not _fits(shape, batch, expected):
             wanted = ", ".join(map(str, (*batch, *expected)))
             return Fault(key, f"{key} must have shape ({wanted}) in a tensordict of batch size {batch}, got {shape}")
@@ -63,7 +67,7 @@ def find_memory_fault(tensordict: TensorDictBase, planner: Any) -> Fault | None:
         return None
     if not isinstance(plan, TensorDictBase):
         return Fault(keys.PLAN, f"{keys.PLAN} must be a tensordict, a planner's memory, got {_kind(plan)}: {remedy}")
-    for name, like in planner.empty_memory(torch.zeros(3)).items():
+    for name, like in planner.empty_memory(torch.zeros(_coordinates(tensordict))).items():
         value, place = plan.get(name, None), f"({keys.PLAN!r}, {name!r})"
         if value is None:
             continue
@@ -73,6 +77,15 @@ def find_memory_fault(tensordict: TensorDictBase, planner: Any) -> Fault | None:
         if tuple(value.shape) != shape:
             return Fault(name, f"{place} must have shape {shape}, got {tuple(value.shape)}: {remedy}")
     return None
+
+
+def _coordinates(tensordict: TensorDictBase) -> int:
+    """Coordinates of the points in ``tensordict``, by the tool's or the target's place; 3 if neither tells."""
+    for key in (keys.TOOL_POS, keys.TARGET_POS):
+        value = tensordict.get(key, None)
+        if isinstance(value, Tensor) and value.ndim and value.shape[-1] in POINT_SIZES:
+            return value.shape[-1]
+    return POINT_SIZES[-1]
 
 
 def _kind(value: Any) -> str:

@@ -27,7 +27,7 @@ class Maneuver(Protocol):
         ...
 
     def __call__(self, plan: Plan, observation: Observation, holds: Tensor, state: Any, /) -> tuple[Tensor, Any]:
-        """The goal at this step, ``(*B, 3)`` [m, world], and the next state.
+        """The goal at this step, ``(*B, D)`` [m, world], and the next state.
 
         Args:
             plan: in use.

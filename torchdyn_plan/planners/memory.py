@@ -155,18 +155,18 @@ class Remembering(TensorDictModuleBase):
             raise explanation from error
 
     def empty_memory(self, like: Tensor) -> dict[str, Tensor]:
-        """Entries below ``plan`` of rows at step 0, in the batch, type and device of ``like`` (*B, 3); none here."""
+        """Entries below ``plan`` of rows at step 0, in the batch, type and device of ``like`` (*B, D); none here."""
         return {}
 
-    def make_tensordict_primer(self, dtype: torch.dtype = torch.float32) -> Any:
+    def make_tensordict_primer(self, dtype: torch.dtype = torch.float32, coordinates: int = 3) -> Any:
         """A TorchRL transform that lets environments carry the memory, `torchrl.envs.TensorDictPrimer`.
 
         Environments that run in other processes, and collectors over them, carry nothing that no spec declares.
-        ``dtype`` is that of the environment's positions.
+        ``dtype`` is that of the environment's positions, and ``coordinates`` how many they have.
         """
         from torchrl.data import Composite, Unbounded
         from torchrl.envs.transforms import TensorDictPrimer
 
-        entries = self.empty_memory(torch.zeros(3, dtype=dtype))
+        entries = self.empty_memory(torch.zeros(coordinates, dtype=dtype))
         specs = {name: Unbounded(shape=value.shape, dtype=value.dtype) for name, value in entries.items()}
         return TensorDictPrimer(Composite({keys.PLAN: Composite(specs)}), default_value=0.0, expand_specs=True)

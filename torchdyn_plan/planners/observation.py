@@ -17,9 +17,9 @@ class Observation(NamedTuple):
     """One step of a batch of robots."""
 
     tool_pos: Tensor
-    """``(*B, 3)`` [m, world]."""
+    """``(*B, D)`` [m, world]."""
     target_pos: Tensor
-    """``(*B, 3)`` [m, world]."""
+    """``(*B, D)`` [m, world]."""
     robot_state: Tensor
     """``(*B, S)``: what the arrival model reads."""
     step_count: Tensor

@@ -11,6 +11,7 @@ from torch import Tensor
 from torchdyn_plan import keys
 from torchdyn_plan.checks import check_choice, check_number
 from torchdyn_plan.errors import InputError
+from torchdyn_plan.nets.analytic import ConstantVelocity
 from torchdyn_plan.nets.arrival import ArrivalModel, FunctionArrival
 from torchdyn_plan.nets.forecast import ForecastModel, FunctionForecast
 from torchdyn_plan.nets.inference import Prepared
@@ -23,6 +24,7 @@ from torchdyn_plan.planners.pretrained import PretrainedPlanner
 from torchdyn_plan.planners.protocol import keys_read, keys_written
 from torchdyn_plan.planners.schedule import ReplanSchedule, Schedule
 from torchdyn_plan.planners.search.corner import CornerSearch
+from torchdyn_plan.planners.search.exact import ExactSearch
 from torchdyn_plan.planners.search.meeting import GoalSearch
 from torchdyn_plan.planners.static.callable import TensorDictFunction
 
@@ -43,8 +45,8 @@ class ComposedPlanner(PretrainedPlanner, Remembering):
     def __init__(
         self,
         static: Callable[..., Any],
-        forecaster: ForecastModel | Callable[..., Any],
-        eta: ArrivalModel | Callable[..., Any],
+        forecaster: ForecastModel | Callable[..., Any] | None = None,
+        eta: ArrivalModel | Callable[..., Any] | None = None,
         *,
         search: GoalSearch | None = None,
         schedule: Schedule | None = None,
@@ -58,25 +60,29 @@ class ComposedPlanner(PretrainedPlanner, Remembering):
 
         Args:
             static: planner for a static goal, from tensordict to tensordict (`StaticPlanner`).
-            forecaster: forecasts the target; a function of its history will do, which returns positions (*B, F, 3).
-            eta: tells how long ``static`` takes to a goal; a function of robot states (*B, 1, S) and goals (*B, K, 3)
-                will do, which returns control steps (*B, K).
-            search: chooses the meeting on the forecast; the paper's corner search by default.
-            schedule: when to plan anew; the paper's by default.
-            maneuver: which goal the static planner is sent to at each step; the meeting place, as in the paper, by
-                default.
+            forecaster: forecasts the target; a function of its history will do, which returns positions (*B, F, D). By
+                default the target goes on as it does, `torchdyn_plan.nets.ConstantVelocity`.
+            eta: tells how long ``static`` takes to a goal; a function of robot states (*B, 1, S) and goals (*B, K, D)
+                will do, which returns control steps (*B, K). By default what ``static`` says of itself.
+            search: chooses the meeting on the forecast; by default the first that can be made, of all its steps.
+            schedule: when to plan anew; every fourth control step by default.
+            maneuver: which goal the static planner is sent to at each step; the meeting place by default.
             delivery: how plans come into use late: `Delayed`, or made in the `Background`; at once by default.
             lost: when a target is lost; None if it cannot be.
             chunk: plan in blocks of exactly this many rows, so that results do not depend on the batch size.
             scene: digest of the scene that the planner belongs to; None if it belongs to none.
+
+        Raises:
+            InputError: a part is of no use, or there is no ``eta`` and ``static`` tells none.
         """
         super().__init__()
         if chunk is not None:
             check_number("chunk", chunk, minimum=1, integer=True)
         self.static = TensorDictFunction.wrap(static)
-        self.forecaster, self.eta = FunctionForecast.wrap(forecaster), FunctionArrival.wrap(eta)
-        self.search = CornerSearch() if search is None else search
-        self.schedule = ReplanSchedule() if schedule is None else schedule
+        self.forecaster = ConstantVelocity() if forecaster is None else FunctionForecast.wrap(forecaster)
+        self.eta = arrival_of(static) if eta is None else FunctionArrival.wrap(eta)
+        self.search = ExactSearch(stride=1, first=1) if search is None else search
+        self.schedule = ReplanSchedule.every(4) if schedule is None else schedule
         self.maneuver, self.delivery = GoTo() if maneuver is None else maneuver, delivery
         self.lost, self.chunk, self.scene = lost, chunk, scene
         self.memory = PlannerMemory(self.schedule, self.maneuver, delivery)
@@ -89,6 +95,18 @@ class ComposedPlanner(PretrainedPlanner, Remembering):
         self.out_keys = keys_written(self.static, keys.GOAL, keys.ARRIVAL_STEPS, *remembered, *reported)
         self.read_besides = [key for key in self.in_keys if key not in (*SEEN_BY_ALL, *self.forecaster.in_keys)]
         self.read_by_static = [key for key in keys_read(self.static) if key not in SEEN_BY_ALL]
+
+    @classmethod
+    def paper(
+        cls,
+        static: Callable[..., Any],
+        forecaster: ForecastModel | Callable[..., Any],
+        eta: ArrivalModel | Callable[..., Any],
+        **parts: Any,
+    ) -> Self:
+        """The paper's configuration: its corner search and its schedule, unless ``parts`` names others."""
+        own: dict[str, Any] = {"search": CornerSearch(), "schedule": ReplanSchedule()}
+        return cls(static, forecaster, eta, **(own | parts))
 
     def with_parts(self, **parts: Any) -> Self:
         """Another planner of the same parts, but for those given, by the names of the constructor's arguments."""
@@ -137,3 +155,14 @@ class ComposedPlanner(PretrainedPlanner, Remembering):
         step = torch.zeros(like.shape[:-1], dtype=torch.int64, device=like.device)
         entries = self.memory.empty(Observation(like, like, like, step, ()))
         return entries | (self.static.empty_memory(like) if isinstance(self.static, Remembering) else {})
+
+
+def arrival_of(static: Any) -> ArrivalModel:
+    """What ``static`` says of its own arrival times; raises `InputError` if it says nothing."""
+    tells = getattr(static, "arrival_model", None)
+    if tells is None:
+        raise InputError(
+            f"eta is needed, as {type(static).__name__} has no arrival_model that tells how long it takes to a goal: "
+            "give a function of robot states and goals, or a model of torchdyn_plan.nets"
+        )
+    return tells()

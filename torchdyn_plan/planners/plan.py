@@ -11,6 +11,7 @@ from torch import Tensor
 from torch.func import debug_unwrap
 
 from torchdyn_plan.checks import check_number
+from torchdyn_plan.errors import InputError
 from torchdyn_plan.planners.observation import Observation
 from torchdyn_plan.planners.search.meeting import Meeting
 
@@ -41,11 +42,11 @@ class Lost(Protocol):
     """Says of places whether a target there is lost; a task whose targets cannot be lost has none."""
 
     def seen(self, target_pos: Tensor) -> Tensor:
-        """Whether a target that is seen at ``target_pos`` (*B, 3) [m, world] is lost: ``(*B,)`` bool."""
+        """Whether a target that is seen at ``target_pos`` (*B, D) [m, world] is lost: ``(*B,)`` bool."""
         ...
 
     def forecast(self, path: Tensor) -> Tensor:
-        """Whether a target that is forecast at each place of ``path`` (*B, F, 3) is lost there: ``(*B, F)`` bool."""
+        """Whether a target that is forecast at each place of ``path`` (*B, F, D) is lost there: ``(*B, F)`` bool."""
         ...
 
 
@@ -65,18 +66,25 @@ class LostBelow:
 
     def seen(self, target_pos: Tensor) -> Tensor:
         """As `Lost.seen`."""
-        return target_pos[..., 2] < self.seen_below
+        return height_of(target_pos) < self.seen_below
 
     def forecast(self, path: Tensor) -> Tensor:
         """As `Lost.forecast`."""
-        return path[..., 2] <= self.forecast_below
+        return height_of(path) <= self.forecast_below
+
+
+def height_of(place: Tensor) -> Tensor:
+    """Height ``(*B,)`` of places (*B, 3) [m]; raises `InputError` for those in a plane, which have none."""
+    if place.shape[-1] != 3:
+        raise InputError(f"LostBelow needs points of 3 coordinates, got {place.shape[-1]}: in a plane nothing is below")
+    return place[..., 2]
 
 
 class Plan(NamedTuple):
     """The plan in use in each row."""
 
     goal: Tensor
-    """``(*B, 3)`` [m, world]."""
+    """``(*B, D)`` [m, world]."""
     arrival_steps: Tensor
     """``(*B,)`` int64 control steps from now to the meeting."""
     clamped: Tensor
@@ -86,7 +94,7 @@ class Plan(NamedTuple):
     usable: Tensor
     """``(*B,)`` bool: the forecast from which it was made was of use."""
     path: Tensor
-    """``(*B, T, 3)`` [m, world]: where the target was expected in 0 … T-1 steps from the moment it was made for."""
+    """``(*B, T, D)`` [m, world]: where the target was expected in 0 … T-1 steps from the moment it was made for."""
     age: Tensor
     """``(*B,)`` int64 control steps since that moment; -1 where no plan was made yet."""
 
@@ -95,7 +103,7 @@ class Plan(NamedTuple):
         """The plan of rows that have none: stay where the tool is, and expect the target to stay where it is."""
         tool_pos, target_pos, step = observation.tool_pos, observation.target_pos, observation.step_count
         yes = torch.ones_like(step, dtype=torch.bool)
-        at_rest = target_pos.unsqueeze(-2).expand(*target_pos.shape[:-1], length, 3)
+        at_rest = target_pos.unsqueeze(-2).expand(*target_pos.shape[:-1], length, target_pos.shape[-1])
         return cls(tool_pos, torch.zeros_like(step), ~yes, yes, yes, at_rest, torch.full_like(step, -1))
 
     @classmethod
@@ -105,8 +113,8 @@ class Plan(NamedTuple):
         Args:
             meeting: what the search found.
             usable: ``(*B,)`` whether the forecast was of use.
-            target_pos: ``(*B, 3)`` the target at the moment for which the plan is made [m, world].
-            path: ``(*B, F, 3)`` where it is expected from then on.
+            target_pos: ``(*B, D)`` the target at the moment for which the plan is made [m, world].
+            path: ``(*B, F, D)`` where it is expected from then on.
             length: positions to remember; the last one is repeated where the forecast ends.
         """
         whole = path.narrow(-2, 0, 0)
@@ -120,7 +128,7 @@ class Plan(NamedTuple):
         return self._replace(arrival_steps=(self.arrival_steps - 1).clamp_min(0), age=self.age + (self.age >= 0))
 
     def held(self, rows: Tensor, tool_pos: Tensor) -> Plan:
-        """The plan, but ``rows`` (*B,) bool stay where their tool is, (*B, 3) [m, world]."""
+        """The plan, but ``rows`` (*B,) bool stay where their tool is, (*B, D) [m, world]."""
         if not (torch.compiler.is_compiling() or debug_unwrap(rows).any()):
             return self
         return self._replace(
@@ -131,10 +139,10 @@ class Plan(NamedTuple):
         )
 
     def ahead(self, count: int) -> Tensor:
-        """Where the target is expected now and in 1 … ``count`` - 1 steps, ``(*B, count, 3)``."""
+        """Where the target is expected now and in 1 … ``count`` - 1 steps, ``(*B, count, D)``."""
         ahead = torch.arange(count, device=self.age.device)
         index = (self.age.clamp_min(0).unsqueeze(-1) + ahead).clamp(max=self.path.shape[-2] - 1)
-        return self.path.gather(-2, index.unsqueeze(-1).expand(*index.shape, 3))
+        return self.path.gather(-2, index.unsqueeze(-1).expand(*index.shape, self.path.shape[-1]))
 
     def status(self, trouble: Tensor, replans: Tensor) -> Tensor:
         """`PlanStatus` of each row, ``(*B,)`` int64, from the code of its input and how many plans it has made."""
@@ -154,7 +162,7 @@ def input_status(observation: Observation, bad: Tensor | None, lost: Lost | None
 
 
 def usable_path(path: Tensor, target_pos: Tensor) -> tuple[Tensor, Tensor]:
-    """The path ``(*B, F, 3)``, a target at rest at ``target_pos`` (*B, 3) where it is of no use, and its use (*B,).
+    """The path ``(*B, F, D)``, a target at rest at ``target_pos`` (*B, D) where it is of no use, and its use (*B,).
 
     Whatever forecasts it, the path has the type of the target's position.
     """

@@ -12,7 +12,8 @@ from torch import Tensor
 from torch.func import debug_unwrap
 
 from torchdyn_plan import keys
-from torchdyn_plan.checks import check_trailing_shape
+from torchdyn_plan.checks import POINT_SIZES, check_points, check_trailing_shape
+from torchdyn_plan.errors import InputError
 from torchdyn_plan.nets.forecast import Forecast, ForecastModel
 from torchdyn_plan.planners.judging import GOOD, LARGEST, act, judge
 from torchdyn_plan.planners.observation import SEEN_BY_ALL, Observation
@@ -28,10 +29,11 @@ from torchdyn_plan.precision import HALVES
 class DynamicPlanner(ComposedPlanner):
     """Meets a moving target: history → forecast → meeting → goal → action.
 
-    Writes ``goal`` (*B, 3) [m, world], ``arrival_steps`` (*B,), what the static planner writes, and under ``plan`` the
+    Writes ``goal`` (*B, D) [m, world], ``arrival_steps`` (*B,), what the static planner writes, and under ``plan`` the
     memory for the next step and each row's `PlanStatus`. A row plans when its schedule says so, and starts afresh at
     ``step_count`` 0. One that cannot plan, as its input or forecast is no number or its target is lost, holds its tool
-    still and tries again at every step; one whose robot is not seen gets action 0. Parts: see `ComposedPlanner`.
+    still and tries again at every step; one whose robot is not seen gets action 0. Points have
+    D coordinates, 2 or 3. Parts: see `ComposedPlanner`.
     """
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
@@ -99,14 +101,17 @@ def observe(tensordict: TensorDictBase, forecaster: ForecastModel) -> Observatio
     values = [value.float() if value.dtype in HALVES else value for value in values]
     tool_pos, target_pos, robot_state, step_count, *seen = values
     if not torch.compiler.is_compiling():
-        if tool_pos.shape[-1:] != (3,) or target_pos.shape[-1:] != (3,):
-            check_trailing_shape(keys.TOOL_POS, tool_pos, 3)
-            check_trailing_shape(keys.TARGET_POS, target_pos, 3)
+        size = tool_pos.shape[-1] if tool_pos.ndim else 0
+        if size not in POINT_SIZES or target_pos.shape[-1:] != (size,):
+            size, other = check_points(keys.TOOL_POS, tool_pos), check_points(keys.TARGET_POS, target_pos)
+            raise InputError(
+                f"{keys.TOOL_POS} and {keys.TARGET_POS} must be of as many coordinates, got {size} and {other}"
+            )
         if keys.TARGET_HISTORY in forecaster.in_keys:
             history = seen[forecaster.in_keys.index(keys.TARGET_HISTORY)]
-            length = forecaster.history or history.shape[-2]
-            if history.shape[-2:] != (length, 3):
-                check_trailing_shape(keys.TARGET_HISTORY, history, length, 3)
+            length = forecaster.history or (history.shape[-2] if history.ndim > 1 else 2)
+            if history.shape[-2:] != (length, size):
+                check_trailing_shape(keys.TARGET_HISTORY, history, length, size)
     step_count = step_count.reshape(tool_pos.shape[:-1])
     if step_count.dtype != torch.int64:
         step_count = step_count.long()

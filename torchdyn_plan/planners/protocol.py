@@ -20,7 +20,7 @@ class StaticPlanner(Protocol):
     """
 
     def __call__(self, tensordict: TensorDictBase, /) -> TensorDictBase:
-        """Write ``action`` (*B, A) for the robot's state and ``goal`` (*B, 3)."""
+        """Write ``action`` (*B, A) for the robot's state and ``goal`` (*B, D)."""
         ...
 
 

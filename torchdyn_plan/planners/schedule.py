@@ -116,8 +116,8 @@ class ReplanSchedule:
         check_number("minimum", self.minimum, minimum=1, integer=True)
 
     @classmethod
-    def every(cls, steps: int, *, first_step: int = 13) -> ReplanSchedule:
-        """A plan at ``first_step`` and every ``steps`` control steps from then on."""
+    def every(cls, steps: int, *, first_step: int = 1) -> ReplanSchedule:
+        """A plan at ``first_step`` and every ``steps`` from then on; at step 1 a target has been seen to move."""
         check_number("steps", steps, minimum=1, integer=True)
         return cls(first_step=first_step, window=steps, shrink=1.0, minimum=steps)
 

@@ -17,7 +17,7 @@ import torch
 from torch import Tensor
 from torch.func import debug_unwrap
 
-from torchdyn_plan.checks import check_number, check_trailing_shape, hides_values
+from torchdyn_plan.checks import POINT_SIZES, check_number, check_trailing_shape, hides_values
 from torchdyn_plan.planners.rows import where_rows
 
 LARGEST = 1e6
@@ -27,11 +27,11 @@ CLOCKS = 1e-4
 
 
 class TrackState(NamedTuple):
-    """What is known of each target: position, velocity and, for n = 3, acceleration, alike along all three axes."""
+    """What is known of each target: position, velocity and, for n = 3, acceleration, alike along all D axes."""
 
     motion: Tensor
-    """``(*B, 3n + n(n+1)/2)`` at ``time``: position, velocity … [m, m/s, m/s²; world], then the covariance of each axis
-    alone, the same for all three, the upper triangle row by row."""
+    """``(*B, Dn + n(n+1)/2)`` at ``time``: position, velocity … [m, m/s, m/s²; world], then the covariance of each axis
+    alone, the same for all, the upper triangle row by row."""
     time: Tensor
     """``(*B,)`` moment of the newest measurement that was used, -inf for none [s]."""
     begin: Tensor
@@ -39,7 +39,7 @@ class TrackState(NamedTuple):
     since: Tensor
     """``(*B,)`` moment from which on the target moves as it does: the first measurement, or that after a bounce [s]."""
     before: Tensor
-    """``(*B, 6)`` position and velocity at ``since`` by the motion before the bounce [m, m/s]."""
+    """``(*B, 2D)`` position and velocity at ``since`` by the motion before the bounce [m, m/s]."""
     used: Tensor
     """``(*B,)`` int64 measurements that were used."""
     restarts: Tensor
@@ -49,35 +49,36 @@ class TrackState(NamedTuple):
 
     @property
     def pos(self) -> Tensor:
-        """``(*B, 3)`` at ``time`` [m, world]."""
-        return self.motion[..., :3]
+        """``(*B, D)`` at ``time`` [m, world]."""
+        return self.motion[..., : _sizes(self.motion)[0]]
 
     @property
     def velocity(self) -> Tensor:
-        """``(*B, 3)`` at ``time`` [m/s, world]."""
-        return self.motion[..., 3:6]
+        """``(*B, D)`` at ``time`` [m/s, world]."""
+        coordinates, _ = _sizes(self.motion)
+        return self.motion[..., coordinates : 2 * coordinates]
 
     @property
     def covariance(self) -> Tensor:
         """``(*B, 2, 2)`` of position and velocity along each axis [m², m²/s; m²/s, m²/s²]."""
-        n = _order(self.motion.shape[-1])
-        own = self.motion[..., 3 * n :]
+        coordinates, n = _sizes(self.motion)
+        own = self.motion[..., coordinates * n :]
         return torch.stack([own[..., :2], torch.stack([own[..., 1], own[..., n]], dim=-1)], dim=-2)
 
     def path(self, time: Tensor) -> Tensor:
-        """Positions ``(*B, T, 3)`` at moments ``time`` (*B, T) [s]: before a bounce by the motion of then [m, world].
+        """Positions ``(*B, T, D)`` at moments ``time`` (*B, T) [s]: before a bounce by the motion of then [m, world].
 
         Before the first measurement the target rests where the motion begins.
         """
         time = torch.maximum(time, self.begin.unsqueeze(-1))
-        since, n = self.since.unsqueeze(-1), _order(self.motion.shape[-1])
+        since, (coordinates, n) = self.since.unsqueeze(-1), _sizes(self.motion)
         # Of rows of which nothing is known the time is infinite.
         passed = time - self.time.clamp_min(-LARGEST).unsqueeze(-1)
-        now = _polynomial(self.motion[..., : 3 * n], passed)
+        now = _polynomial(self.motion[..., : coordinates * n], passed, coordinates)
         earlier = time < since
         if not (hides_values(earlier) or debug_unwrap(earlier).any()):
             return now
-        return torch.where(earlier.unsqueeze(-1), _polynomial(self.before, time - since), now)
+        return torch.where(earlier.unsqueeze(-1), _polynomial(self.before, time - since, coordinates), now)
 
 
 class Measurement(NamedTuple):
@@ -86,16 +87,16 @@ class Measurement(NamedTuple):
     time: Tensor
     """``(*B,)`` when it was taken; NaN for none [s]."""
     pos: Tensor
-    """``(*B, 3)`` [m, world]."""
+    """``(*B, D)`` [m, world]."""
     variance: Tensor | float
     """``(*B,)`` of its error along each axis [m²]."""
 
 
 class Prediction(NamedTuple):
-    """What is expected of a measurement in each row. Components come first: ``(3, *B)``, and ``(1, *B)`` for one."""
+    """What is expected of a measurement in each row. Components come first: ``(D, *B)``, and ``(1, *B)`` for one."""
 
     mean: list[Tensor]
-    """n of ``(3, *B)``: the motion at the moment of the newest measurement, this one included."""
+    """n of ``(D, *B)``: the motion at the moment of the newest measurement, this one included."""
     covariance: list[list[Tensor]]
     """The rows of its upper triangle, ``(1, *B)`` each."""
     passed: Tensor
@@ -103,7 +104,7 @@ class Prediction(NamedTuple):
     lever: list[Tensor]
     """n of ``(1, *B)``: covariance of the motion with the position that was measured."""
     innovation: Tensor
-    """``(3, *B)`` what was measured less what was expected [m]."""
+    """``(D, *B)`` what was measured less what was expected [m]."""
     variance: Tensor
     """``(1, *B)`` of the innovation along each axis [m²]."""
 
@@ -170,12 +171,15 @@ class Track(ABC):
         return tuple(found)
 
     def start(self, like: Tensor) -> TrackState:
-        """The state of rows of which nothing is known, in the batch, type and device of ``like`` (*B, 3)."""
-        batch, n = like.shape[:-1], self.order
+        """The state of rows of which nothing is known, in the batch, type and device of ``like`` (*B, D)."""
+        *batch, coordinates = like.shape
+        n = self.order
         none = torch.zeros(batch, dtype=torch.int64, device=like.device)
         zero = like.new_zeros(batch)
-        motion = like.new_zeros(*batch, 3 * n + n * (n + 1) // 2)
-        return TrackState(motion, zero - torch.inf, zero, zero, like.new_zeros(*batch, 6), none, none, none)
+        motion = like.new_zeros(*batch, coordinates * n + n * (n + 1) // 2)
+        return TrackState(
+            motion, zero - torch.inf, zero, zero, like.new_zeros(*batch, 2 * coordinates), none, none, none
+        )
 
     def add(
         self, state: TrackState, time: Tensor, pos: Tensor, now: Tensor, *, variance: Tensor | float | None = None
@@ -185,16 +189,17 @@ class Track(ABC):
         Args:
             state: before.
             time: ``(*B,)`` when it was taken [s].
-            pos: ``(*B, 3)`` [m, world].
+            pos: ``(*B, D)`` [m, world].
             now: ``(*B,)`` the present [s].
             variance: ``(*B,)`` of its error along each axis [m²]; the square of ``noise`` for None.
 
         Raises:
             InputError: a shape is wrong.
         """
-        if pos.shape != (*time.shape, 3) or time.shape != state.time.shape:
+        coordinates, _ = _sizes(state.motion)
+        if pos.shape != (*time.shape, coordinates) or time.shape != state.time.shape:
             check_trailing_shape("time of a measurement", time, *state.time.shape)
-            check_trailing_shape("pos of a measurement", pos, *state.time.shape, 3)
+            check_trailing_shape("pos of a measurement", pos, *state.time.shape, coordinates)
         # A camera is slower than the loop: at most steps nothing comes.
         if not hides_values(time) and debug_unwrap(time).isnan().all():
             return state
@@ -219,7 +224,7 @@ class Track(ABC):
 
     def _expect(self, state: TrackState, measured: Measurement) -> Prediction:
         """What is expected in place of what was measured."""
-        mean, covariance = _unpacked(state.motion, self.order)
+        mean, covariance = _unpacked(state.motion)
         passed = (measured.time - state.time).unsqueeze(0)
         ahead = passed.clamp_min(0.0)
         covariance = self._spread(covariance, ahead)
@@ -250,7 +255,7 @@ class Track(ABC):
         return found
 
     def _fit(self, expected: Prediction) -> Tensor:
-        """Whether a measurement is where it was expected, along each axis ``(3, *B)`` bool."""
+        """Whether a measurement is where it was expected, along each axis ``(D, *B)`` bool."""
         return expected.innovation.square() <= self.gate**2 * expected.variance
 
     def _used(self, state: TrackState, expected: Prediction, time: Tensor) -> TrackState:
@@ -376,14 +381,19 @@ class LeastSquaresTrack(Track):
         return 0.0
 
 
-def _order(size: int) -> int:
-    """N of a motion of 3n + n(n+1)/2 numbers."""
-    return 2 if size == 9 else 3
+SIZES = {d * n + n * (n + 1) // 2: (d, n) for d in POINT_SIZES for n in (2, 3)}
+"""Coordinates D and order n by the numbers of a motion, Dn + n(n+1)/2: no two have as many."""
 
 
-def _unpacked(motion: Tensor, n: int) -> tuple[list[Tensor], list[list[Tensor]]]:
-    """Mean, n of ``(3, *B)``, and the rows of the covariance's upper triangle, ``(1, *B)`` each."""
-    parts = list(motion.movedim(-1, 0).split([3] * n + [1] * (n * (n + 1) // 2)))
+def _sizes(motion: Tensor) -> tuple[int, int]:
+    """Coordinates D and order n of ``motion`` (*B, Dn + n(n+1)/2)."""
+    return SIZES[motion.shape[-1]]
+
+
+def _unpacked(motion: Tensor) -> tuple[list[Tensor], list[list[Tensor]]]:
+    """Mean, n of ``(D, *B)``, and the rows of the covariance's upper triangle, ``(1, *B)`` each."""
+    coordinates, n = _sizes(motion)
+    parts = list(motion.movedim(-1, 0).split([coordinates] * n + [1] * (n * (n + 1) // 2)))
     mean, rest, rows = parts[:n], parts[n:], []
     for i in range(n):
         rows.append(rest[: n - i])
@@ -392,7 +402,7 @@ def _unpacked(motion: Tensor, n: int) -> tuple[list[Tensor], list[list[Tensor]]]
 
 
 def _packed(mean: list[Tensor], covariance: list[list[Tensor]]) -> Tensor:
-    """The motion ``(*B, 3n + n(n+1)/2)``; in memory its components come first, which makes them cheap to take apart."""
+    """The motion ``(*B, Dn + n(n+1)/2)``; in memory its components come first, which makes them cheap to take apart."""
     return torch.cat([*mean, *(entry for row in covariance for entry in row)]).movedim(0, -1)
 
 
@@ -426,7 +436,7 @@ def _power(value: Tensor, exponent: int) -> Tensor:
     return found
 
 
-def _polynomial(motion: Tensor, passed: Tensor) -> Tensor:
-    """Positions ``(*B, T, 3)`` after ``passed`` (*B, T) [s] from position, velocity … ``(*B, 3n)``."""
-    terms = motion.unsqueeze(-2).split(3, dim=-1)
+def _polynomial(motion: Tensor, passed: Tensor, coordinates: int) -> Tensor:
+    """Positions ``(*B, T, D)`` after ``passed`` (*B, T) [s] from position, velocity … ``(*B, Dn)``."""
+    terms = motion.unsqueeze(-2).split(coordinates, dim=-1)
     return _sum(terms, _factors(passed.unsqueeze(-1), len(terms)))

@@ -11,7 +11,7 @@ from tensordict.nn import TensorDictModuleBase
 from torch import Tensor
 
 from torchdyn_plan import keys
-from torchdyn_plan.checks import check_number, check_trailing_shape
+from torchdyn_plan.checks import check_number, check_points, check_trailing_shape
 from torchdyn_plan.errors import InputError
 from torchdyn_plan.planners.memory import Remembering, remember, warn_of_loss
 from torchdyn_plan.planners.plan import PlanStatus
@@ -32,7 +32,7 @@ SHOWN = (keys.TARGET_POS, keys.TARGET_HISTORY, keys.TARGET_COVARIANCE)
 class TrackedPlanner(PretrainedPlanner, Remembering):
     """Puts a `Track` between what is measured of the target and a planner, whose ``target_pos`` and history it writes.
 
-    Reads ``measured_pos`` (*B, M, 3) and ``measured_time`` (*B, M), up to M measurements that have come since the last
+    Reads ``measured_pos`` (*B, M, D) and ``measured_time`` (*B, M), up to M measurements that have come since the last
     step; where they are absent, ``target_pos`` is one of now. The planner sees where the target is now by the track,
     its past at each control step, and the covariance of the two; afterwards these entries are as they were. Rows
     without a usable track are `PlanStatus.NO_TRACK`: they hold still until there is one. ``track_restarts`` and
@@ -78,7 +78,7 @@ class TrackedPlanner(PretrainedPlanner, Remembering):
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         """Take in what was measured, and let the planner act on it."""
         like, step_count = read(tensordict, keys.TARGET_POS, "TrackedPlanner"), read(tensordict, keys.STEP_COUNT, "")
-        check_trailing_shape(keys.TARGET_POS, like, 3)
+        check_points(keys.TARGET_POS, like)
         step_count = step_count.reshape(like.shape[:-1])
         now = step_count.to(like.dtype) * self.control_step
         state = self._measure(self._recall(tensordict, like, step_count), tensordict, like, now)
@@ -128,7 +128,7 @@ class TrackedPlanner(PretrainedPlanner, Remembering):
         pos, time = tensordict.get(keys.MEASURED_POS, None), tensordict.get(keys.MEASURED_TIME, None)
         if pos is None or time is None:
             return self.track.add(state, now, target_pos, now)
-        check_trailing_shape(keys.MEASURED_POS, pos, *time.shape, 3)
+        check_trailing_shape(keys.MEASURED_POS, pos, *time.shape, target_pos.shape[-1])
         for slot in range(time.shape[-1]):
             state = self.track.add(state, time[..., slot], pos[..., slot, :], now)
         return state

@@ -86,7 +86,7 @@ class Truth(NamedTuple):
     """What is known of E episodes before a planner plays them."""
 
     future: Tensor
-    """``(E, T, 3)`` positions of the targets at steps 0 … T-1, had no robot touched them [m, world]."""
+    """``(E, T, D)`` positions of the targets at steps 0 … T-1, had no robot touched them [m, world]."""
     solvable: Tensor
     """``(E,)`` bool: episodes that can be solved at all, by the task's notion of it."""
 

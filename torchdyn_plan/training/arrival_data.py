@@ -6,7 +6,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from torchdyn_plan.checks import check_finite, check_trailing_shape
+from torchdyn_plan.checks import check_finite, check_points, check_trailing_shape
 from torchdyn_plan.errors import InputError
 from torchdyn_plan.training.shards import read_shards
 
@@ -38,7 +38,7 @@ def load_arrivals(folder: Path, *, state_size: int | None = None) -> Arrivals:
     """
     shards = read_shards(folder, "arrivals", Arrivals._fields)
     data = Arrivals(*(torch.cat([shard[name] for shard in shards]) for name in Arrivals._fields))
-    check_trailing_shape("goal", data.goal, 3)
+    check_points("goal", data.goal)
     for name, least in (("arrival", -1), ("nearest", 0), ("run", None)):
         values = getattr(data, name)
         if values.dtype != torch.int64 or (least is not None and bool((values < least).any())):

@@ -13,7 +13,7 @@ from torch import Tensor
 
 from torchdyn_plan.checks import check_choice, check_count, check_seed, check_threads
 from torchdyn_plan.errors import InputError
-from torchdyn_plan.files import exists, short_path, write_json, write_tensors
+from torchdyn_plan.files import exists, read_metadata, short_path, write_json, write_tensors
 from torchdyn_plan.nets.policy import Actor
 from torchdyn_plan.planners import PolicyPlanner, StaticPlanner
 from torchdyn_plan.progress import progress_bar
@@ -21,6 +21,7 @@ from torchdyn_plan.tasks.task import Task, load_task
 from torchdyn_plan.threads import one_thread
 from torchdyn_plan.training import shards
 from torchdyn_plan.training.shards import check_made, content_digest, shard_path, shard_sizes, surplus_shards
+from torchdyn_plan.training.tracks import at_control_steps, read_tracks, shard_of
 from torchdyn_plan.versions import library_versions
 
 ENTRIES = {
@@ -92,6 +93,54 @@ def collect(
     write_json(out / f"{what}-{seed}.json", about)
 
 
+def collect_tracks(task: Task | str, file: Path, out: Path, *, seed: int = 0) -> int:
+    """Write a person's own recordings of targets into ``out``, as `collect` writes paths; returns how many there are.
+
+    Args:
+        task: whose control step they are brought to, or its name.
+        file: as `torchdyn_plan.training.tracks.read_tracks` reads it.
+        out: folder.
+        seed: number of the series that they make up.
+
+    Raises:
+        InputError: the file is of no use (the message names row and column), fewer than two tracks are long enough
+            for the task's forecaster, or other data lie in the folder.
+        OutputError: the folder cannot be written to.
+    """
+    task = load_task(task)
+    check_seed(seed)
+    paths = at_control_steps(read_tracks(file), task.control_step)
+    _check_long_enough(task, file, paths)
+    wanted = _Wanted(task.name, "paths", str(out), len(paths), seed, 1, 1, "", None, str(file))
+    for surplus in surplus_shards(out, "paths", seed, wanted.shards):
+        raise InputError(f"{short_path(surplus)} holds other paths: give another folder or seed, or delete it")
+    size = shards.SHARD["paths"]
+    for index in range(wanted.shards):
+        tensors = shard_of(paths[index * size : (index + 1) * size], task.control_step)
+        path, content = shard_path(out, "paths", seed, index), content_digest(tensors)
+        if exists(path) and read_metadata(path, InputError).get("content") != content:
+            raise InputError(f"{short_path(path)} holds other paths: give another folder or seed, or delete it")
+        made = {"scene": task.digest(), "num_envs": "1", "episodes": str(len(tensors["length"]))}
+        write_tensors(path, tensors, made | {"shard": path.stem, "content": content})
+    about = {"arguments": asdict(wanted), "scene": task.digest(), "versions": library_versions()}
+    write_json(out / f"paths-{seed}.json", about)
+    return len(paths)
+
+
+def _check_long_enough(task: Task, file: Path, paths: list[Tensor]) -> None:
+    """Raise `InputError` unless two of ``paths`` have a window: one to fit to, and one to hold out."""
+    needed = 2
+    if task.fitting is not None:
+        fitting = task.fitting()
+        needed = fitting.forecaster.horizon + fitting.windows.first_step + 1
+    if sum(len(path) >= needed for path in paths) < 2:
+        longest = max(map(len, paths), default=0)
+        raise InputError(
+            f"{short_path(Path(file))} needs 2 tracks of {needed} control steps of {task.control_step:g} s, which the "
+            f"forecaster of {task.name} sees and looks ahead, got {len(paths)} tracks of up to {longest}"
+        )
+
+
 @dataclass(frozen=True)
 class _Wanted:
     """What a collection was asked for: the arguments in its description."""
@@ -105,6 +154,7 @@ class _Wanted:
     num_threads: int
     static: str
     weights: str | None = None
+    tracks: str | None = None
 
     def __post_init__(self) -> None:
         check_count("episodes", self.episodes)
@@ -141,7 +191,7 @@ def _recorder(task: Task, wanted: _Wanted, planner: StaticPlanner | None) -> Cal
     if wanted.what == "paths":
         record_paths = task.record_paths
         if record_paths is None:
-            raise InputError(f"{task.name} records no paths")
+            raise InputError(f"{task.name} records no paths: give a file of tracks, by --from")
         return lambda index: record_paths(wanted.blocks(index), seed=wanted.seed, num_threads=threads)
     record_arrivals = task.record_arrivals
     if record_arrivals is None:

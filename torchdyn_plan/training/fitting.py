@@ -44,7 +44,7 @@ class Fitting:
 
     forecaster: ForecasterConfig
     """Of the forecaster, unless another is asked for."""
-    eta: ETAConfig
+    eta: ETAConfig = field(default_factory=ETAConfig)
     """Of the arrival-time network, unless another is asked for."""
     spread: bool = False
     """Whether a spread can be fitted to the forecaster's errors; its sizes are the forecaster's."""

@@ -101,7 +101,7 @@ def record_sequence(runner: Runner, plan: RunPlan, draw: torch.Generator) -> dic
     """
     runner.reset()
     count, size = runner.robot_state.shape
-    states, tools = (torch.empty(plan.sequence + 1, count, width) for width in (size, 3))
+    states, tools = (torch.empty(plan.sequence + 1, count, width) for width in (size, runner.tool_pos.shape[-1]))
     goal, given = plan.goals(count, draw), torch.zeros(count, dtype=torch.int64)
     turning = _turning(plan, count, draw)
     samples: list[dict[str, Tensor]] = []

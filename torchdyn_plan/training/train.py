@@ -15,8 +15,8 @@ def networks(task: Task) -> tuple[str, ...]:
     """Names of the networks that ``task`` can train: those fitted to data, then its policies."""
     fitted: tuple[str, ...] = ()
     if task.fitting is not None:
-        if task.record_paths is not None:
-            fitted += ("forecaster", "spread")
+        # Paths may come from a file, too.
+        fitted += ("forecaster", "spread")
         if task.record_arrivals is not None:
             fitted += ("eta", NEAREST_ETA)
     return (*fitted, *task.policies)

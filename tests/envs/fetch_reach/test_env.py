@@ -12,7 +12,7 @@ from torchdyn_plan.envs.fetch_reach.goal_motion import MOTIONS, goal_places
 from torchdyn_plan.envs.fetch_reach.keys import KEYS
 from torchdyn_plan.errors import InputError
 
-SIZES = {"N": 7, "A": 4, "H": 8, "S": STATE_SIZE}
+SIZES = {"D": 3, "N": 7, "A": 4, "H": 8, "S": STATE_SIZE}
 TABLE = (*keys.KEYS, *KEYS)
 
 

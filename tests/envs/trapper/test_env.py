@@ -16,7 +16,7 @@ from torchdyn_plan.tasks.trapper.approach import BoxApproach
 from torchdyn_plan.tasks.trapper.task import ik_planner
 
 SCENE = TrapperScene()
-SIZES = {"N": 6, "A": 6, "H": 24, "S": 15}
+SIZES = {"D": 3, "N": 6, "A": 6, "H": 24, "S": 15}
 
 
 def straight_down():

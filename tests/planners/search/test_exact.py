@@ -206,6 +206,29 @@ def test_goals_are_clamped_and_lifted():
     assert not bool(meet(ExactSearch(half_extent=0.4, footprint=0.1), forecast, here, robot()[0]).reachable)
 
 
+@pytest.mark.parametrize("offset", [(0.0, 0.0, 0.2), (0.1, -0.1, 0.0)])
+def test_with_an_offset_the_robot_waits_beside_the_target(offset):
+    forecast, here = line((0.6, 0.0), (-0.004, 0.0))
+    search = ExactSearch(stride=1, first=1, offset=offset, descent_steps=6.0)
+    eta, asked = robot()
+    found = meet(search, forecast, here, eta)
+    place = forecast[found.arrival_steps - 1]
+    torch.testing.assert_close(found.goal, place + torch.tensor(offset))
+    # It is asked for where it waits, and there in time for the way from there.
+    steps = (found.goal - torch.tensor([0.0, 0.0, HEIGHT])).norm() / 0.01
+    assert 0.0 <= found.arrival_steps - 6.0 - steps < 2.0
+    assert len(asked) == 1
+
+
+@pytest.mark.parametrize(
+    ("offset", "message"),
+    [((0.1,), "two or three numbers"), ((0.1, 0.0, float("nan")), "finite"), ((0.1, 0.0), "2 numbers, but places 3")],
+)
+def test_an_offset_that_is_none_is_named(offset, message):
+    with pytest.raises(InputError, match=f"offset .*{message}"):
+        meet(ExactSearch(offset=offset), *line((0.6, 0.0), (-0.004, 0.0)), robot()[0])
+
+
 def test_dwells_agree_with_counting():
     forecast, here = paths(6, seed=2)
     path = torch.cat([here.unsqueeze(-2), forecast], dim=-2)

@@ -23,6 +23,11 @@ def test_any_batch_and_action_size(batch):
     assert act(tool, tool + 1.0).dtype == torch.float64
 
 
+def test_an_action_has_as_many_entries_as_the_goal_unless_it_is_told():
+    assert act(torch.zeros(4, 2), torch.ones(4, 2), action_size=None).tolist() == [[1.0, 1.0]] * 4
+    assert act(torch.zeros(2), torch.ones(2), action_size=3).tolist() == [1.0, 1.0, 0.0]
+
+
 def test_bad_input_is_named():
     tool = torch.zeros(2, 3)
     with pytest.raises(InputError, match="goal must have shape"):
@@ -34,4 +39,6 @@ def test_bad_input_is_named():
     with pytest.raises(InputError, match="gain"):
         ProportionalController(gain=-1.0)
     with pytest.raises(InputError, match="action_size"):
-        ProportionalController(gain=20.0, action_size=2)
+        ProportionalController(gain=20.0, action_size=1)
+    with pytest.raises(InputError, match="action_size must be at least the 3"):
+        act(tool, tool, action_size=2)

@@ -34,7 +34,12 @@ class Sometimes(Straight):
 
 
 def make_planner(**settings):
-    parts = {"search": SEARCH, "schedule": ReplanSchedule.every(5), "maneuver": MANEUVER, "lost": POCKETED}
+    parts = {
+        "search": SEARCH,
+        "schedule": ReplanSchedule.every(5, first_step=13),
+        "maneuver": MANEUVER,
+        "lost": POCKETED,
+    }
     return DynamicPlanner(go_straight(), Sometimes(horizon=150), StraightArrival(), **(parts | settings))
 
 

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Literal
 import torch
 from torch import Tensor
 
-from torchdyn_plan.checks import check_choice, check_trailing_shape
+from torchdyn_plan.checks import check_choice, check_points, check_trailing_shape
 from torchdyn_plan.planners.search.meeting import NO_CONTEXT, Meeting, SearchContext
 
 if TYPE_CHECKING:
@@ -19,7 +19,7 @@ if TYPE_CHECKING:
     from torchdyn_plan.nets.forecast import Forecast
 
 CORNERS = ((1.0, 1.0, 0.0), (1.0, -1.0, 0.0), (-1.0, -1.0, 0.0), (-1.0, 1.0, 0.0))
-"""Of a square around the target, in half-edges."""
+"""Of a level square around the target, in half-edges; in a plane without the last coordinate."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -50,9 +50,9 @@ def search_corners(forecast: Tensor, target_pos: Tensor, eta: Callable[[Tensor],
     Where it never arrives, its time is the one that the predictor finds likeliest if it did.
 
     Args:
-        forecast: ``(*B, F, 3)`` [m, world], target positions in 1 … F control steps; a meeting in e steps is entry e-1.
-        target_pos: ``(*B, 3)`` [m, world], the target now: a meeting in 0 steps.
-        eta: maps goals ``(*B, K, 3)`` to arrivals ``(*B, K)``; called with K = 1, then with K = 4.
+        forecast: ``(*B, F, D)`` [m, world], target positions in 1 … F control steps; a meeting in e steps is entry e-1.
+        target_pos: ``(*B, D)`` [m, world], the target now: a meeting in 0 steps.
+        eta: maps goals ``(*B, K, D)`` to arrivals ``(*B, K)``; called with K = 1, then with K = 4.
 
     Returns:
         The meeting; indices beyond the horizon are cut to F, which `clamped` tells.
@@ -60,9 +60,9 @@ def search_corners(forecast: Tensor, target_pos: Tensor, eta: Callable[[Tensor],
     Raises:
         InputError: ``target_pos`` or ``forecast`` has another shape, or their batches differ.
     """
-    check_trailing_shape("target_pos", target_pos, 3)
+    size = check_points("target_pos", target_pos)
     horizon = forecast.shape[-2] if forecast.ndim > 1 else 1
-    check_trailing_shape("forecast", forecast, *target_pos.shape[:-1], horizon, 3)
+    check_trailing_shape("forecast", forecast, *target_pos.shape[:-1], horizon, size)
     now = target_pos.unsqueeze(-2)
     path = torch.cat([now, forecast], dim=-2)
 
@@ -71,7 +71,7 @@ def search_corners(forecast: Tensor, target_pos: Tensor, eta: Callable[[Tensor],
     away = _at(path, steps) - now
     half_edge = torch.linalg.vector_norm(away, dim=-1, keepdim=True)
 
-    corners = torch.addcmul(now, half_edge, path.new_tensor(CORNERS))
+    corners = torch.addcmul(now, half_edge, path.new_tensor(CORNERS)[:, :size])
     arrival = eta(corners)
     steps, beyond = _on_path(arrival.steps, horizon)
     met = _at(path, steps)
@@ -93,5 +93,5 @@ def _on_path(steps: Tensor, horizon: int) -> tuple[Tensor, Tensor]:
 
 
 def _at(path: Tensor, index: Tensor) -> Tensor:
-    """Entries ``index`` (*B, K) of ``path`` (*B, T, 3): (*B, K, 3)."""
-    return path.gather(-2, index.unsqueeze(-1).expand(*index.shape, 3))
+    """Entries ``index`` (*B, K) of ``path`` (*B, T, D): (*B, K, D)."""
+    return path.gather(-2, index.unsqueeze(-1).expand(*index.shape, path.shape[-1]))

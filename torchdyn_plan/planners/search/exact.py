@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, NamedTuple
 import torch
 from torch import Tensor
 
-from torchdyn_plan.checks import check_number, check_trailing_shape
+from torchdyn_plan.checks import POINT_SIZES, check_number, check_points, check_trailing_shape, check_vector
 from torchdyn_plan.errors import InputError
 from torchdyn_plan.planners.search.meeting import NO_CONTEXT, Meeting, SearchContext
 from torchdyn_plan.precision import exact_product
@@ -35,9 +35,9 @@ class Candidates(NamedTuple):
     steps: Tensor
     """``(K,)`` int64 control steps from now."""
     places: Tensor
-    """``(*B, K, 3)`` [m, world], where the target is then."""
+    """``(*B, K, D)`` [m, world], where the target is then."""
     goals: Tensor
-    """``(*B, K, 3)`` [m, world], where the tool is sent to meet it."""
+    """``(*B, K, D)`` [m, world], where the tool is sent to meet it."""
     target_steps: Tensor
     """``(*B, K)`` or ``(K,)`` int64: control steps until the target comes within the footprint."""
     score: Tensor
@@ -70,9 +70,11 @@ class ExactSearch:
     first: int = 2
     """Step of the first candidate; the middle of the first arrival bin."""
     height: float | None = None
-    """Height of the goals, above the target to wait there [m]; None for the target's own."""
+    """Height of the goals in space, above the target to wait there [m]; None for the target's own."""
     half_extent: float | None = None
     """Goals are clamped to the square of this half-side, where the tool can be; None to leave them [m]."""
+    offset: tuple[float, ...] | None = None
+    """From the target to the goal, where the tool waits, a number for each axis [m]; None for no way at all."""
     descent_steps: float = 0.0
     """Control steps that the robot needs from the goal to the target."""
     margin: float = 0.0
@@ -128,6 +130,8 @@ class ExactSearch:
                 raise InputError(f"base_pos must be x and y [m], got {self.base_pos!r}")
             for coordinate in self.base_pos:
                 check_number("base_pos", coordinate)
+        if self.offset is not None:
+            object.__setattr__(self, "offset", check_vector("offset", self.offset))
         if self.probability_weight > 0.0 and self.coarse > 1:
             raise InputError(f"a probability_weight needs all candidates at once: coarse must be 1, got {self.coarse}")
         if self.half_extent is not None:
@@ -142,8 +146,8 @@ class ExactSearch:
 
         Args:
             forecast: of the target in 1 … F control steps; its spread is read with a ``probability_weight``.
-            target_pos: ``(*B, 3)`` [m, world], the target now.
-            eta: maps goals ``(*B, K, 3)`` to arrivals ``(*B, K)``; called once, with the keyword ``estimator``.
+            target_pos: ``(*B, D)`` [m, world], the target now.
+            eta: maps goals ``(*B, K, D)`` to arrivals ``(*B, K)``; called once, with the keyword ``estimator``.
             context: what else is known.
 
         Returns:
@@ -177,14 +181,14 @@ class ExactSearch:
             best, reachable = self._choose(candidates, kept, eta_steps, probability)
         goals, target_steps = candidates.goals, candidates.target_steps
         return Meeting(
-            goal=goals.gather(-2, best.unsqueeze(-1).expand(*best.shape, 3)).squeeze(-2),
+            goal=goals.gather(-2, best.unsqueeze(-1).expand(*best.shape, goals.shape[-1])).squeeze(-2),
             arrival_steps=target_steps.expand(goals.shape[:-1]).gather(-1, best).squeeze(-1),
             clamped=torch.zeros_like(reachable),
             reachable=reachable,
         )
 
     def _ask(self, goals: Tensor, eta: ArrivalQuery, tool_pos: Tensor | None) -> tuple[Tensor, Arrival]:
-        """Control steps (*B, K) to each goal (*B, K, 3), infinitely many where the robot never arrives; the arrival."""
+        """Control steps (*B, K) to each goal (*B, K, D), infinitely many where the robot never arrives; the arrival."""
         arrival = eta(goals, estimator="distribution" if self.probability_weight > 0.0 else "expectation")
         eta_steps = arrival.steps.masked_fill(arrival.never, torch.inf)
         if tool_pos is None or self.arrival_radius == 0.0:
@@ -216,7 +220,7 @@ class ExactSearch:
         return score.argmax(dim=-1, keepdim=True), some.squeeze(-1)
 
     def candidates(self, path: Tensor, target_pos: Tensor, lost: Lost | None = None) -> Candidates:
-        """Where and when a target could be met that is at ``target_pos`` (*B, 3) and then along ``path`` (*B, F, 3)."""
+        """Where and when a target could be met that is at ``target_pos`` (*B, D) and then along ``path`` (*B, F, D)."""
         whole = torch.cat([target_pos.unsqueeze(-2), path], dim=-2)
         first = min(self.first, path.shape[-2])
         steps = torch.arange(first, whole.shape[-2], self.stride, device=path.device)
@@ -234,11 +238,15 @@ class ExactSearch:
         return Candidates(steps, places, goals, steps - before, dwell - cost, dwell, lost_there)
 
     def goals(self, places: Tensor) -> Tensor:
-        """Where the tool is sent to meet a target at ``places`` (*B, 3) [m, world]."""
+        """Where the tool is sent to meet a target at ``places`` (*B, D) [m, world]."""
+        if self.offset is not None:
+            if len(self.offset) != places.shape[-1]:
+                raise InputError(f"offset has {len(self.offset)} numbers, but places {places.shape[-1]} coordinates")
+            places = places + places.new_tensor(self.offset)
         level, height = places[..., :2], places[..., 2:]
         if self.half_extent is not None:
             level = level.clamp(-self.half_extent, self.half_extent)
-        if self.height is not None:
+        if self.height is not None and height.shape[-1]:
             return torch.nn.functional.pad(level, (0, 1), value=self.height)
         return places if self.half_extent is None else torch.cat([level, height], dim=-1)
 
@@ -246,8 +254,8 @@ class ExactSearch:
         """How many steps before each candidate the target is at its place already, and how long it dwells in all.
 
         Args:
-            path: ``(*B, F + 1, 3)`` [m, world], the target now and in 1 … F steps.
-            goals: ``(*B, K, 3)`` [m, world], at every ``stride``-th position of the path from the ``first`` on.
+            path: ``(*B, F + 1, D)`` [m, world], the target now and in 1 … F steps.
+            goals: ``(*B, K, D)`` [m, world], at every ``stride``-th position of the path from the ``first`` on.
             first: step of the first candidate.
             gone: ``(*B, F + 1)`` bool: where the target is lost, and dwells nowhere.
 
@@ -270,12 +278,12 @@ class ExactSearch:
 
 def check_context(path: Tensor, target_pos: Tensor, context: SearchContext = NO_CONTEXT) -> None:
     """Raise `InputError` where a shape is wrong."""
-    batch = target_pos.shape[:-1]
-    if path.ndim < 2 or path.shape[:-2] != batch or path.shape[-1] != 3 or target_pos.shape[-1:] != (3,):
-        check_trailing_shape("target_pos", target_pos, 3)
-        check_trailing_shape("forecast", path, *batch, path.shape[-2] if path.ndim > 1 else 1, 3)
+    batch, size = target_pos.shape[:-1], target_pos.shape[-1] if target_pos.ndim else 0
+    if size not in POINT_SIZES or path.ndim < 2 or path.shape != (*batch, path.shape[-2], size):
+        size = check_points("target_pos", target_pos)
+        check_trailing_shape("forecast", path, *batch, path.shape[-2] if path.ndim > 1 else 1, size)
     if context.tool_pos is not None and context.tool_pos.shape != target_pos.shape:
-        check_trailing_shape("tool_pos", context.tool_pos, *batch, 3)
+        check_trailing_shape("tool_pos", context.tool_pos, *batch, size)
     if context.planned_steps is not None and context.planned_steps.shape != batch:
         check_trailing_shape("planned_steps", context.planned_steps, *batch)
 
@@ -287,8 +295,8 @@ def choose_nearby(
 
     Args:
         choose: makes its choice from the steps needed to each goal ``(*B, K)``; returns its index ``(*B, 1)`` first.
-        ask: maps goals ``(*B, k, 3)`` to the steps needed ``(*B, k)``; called twice.
-        goals: ``(*B, K, 3)``, along a path: from one to the next the steps needed change little.
+        ask: maps goals ``(*B, k, D)`` to the steps needed ``(*B, k)``; called twice.
+        goals: ``(*B, K, D)``, along a path: from one to the next the steps needed change little.
         coarse: first every so many goals are asked for, then as many and one around the best guess.
     """
     count = goals.shape[-2]
@@ -303,7 +311,7 @@ def choose_nearby(
     window = (guess - coarse + 1).clamp(0, count - width) + torch.arange(width, device=goals.device)
     known = torch.full_like(goals[..., 0], torch.inf, dtype=eta_steps.dtype)
     known[..., ::coarse] = eta_steps
-    nearby = goals.gather(-2, window.unsqueeze(-1).expand(*window.shape, 3))
+    nearby = goals.gather(-2, window.unsqueeze(-1).expand(*window.shape, goals.shape[-1]))
     return choose(known.scatter(-1, window, ask(nearby)))
 
 

@@ -17,7 +17,7 @@ class Meeting(NamedTuple):
     """Where and when robot and target meet."""
 
     goal: Tensor
-    """``(*B, 3)`` [m, world]: where they meet."""
+    """``(*B, D)`` [m, world]: where they meet."""
     arrival_steps: Tensor
     """``(*B,)`` int64: control steps from now to the meeting, at most the horizon."""
     clamped: Tensor
@@ -30,7 +30,7 @@ class SearchContext(NamedTuple):
     """What a search may want to know beside forecast and arrival; each is None where nobody knows it."""
 
     tool_pos: Tensor | None = None
-    """``(*B, 3)`` [m, world], to tell goals that are reached already."""
+    """``(*B, D)`` [m, world], to tell goals that are reached already."""
     planned_steps: Tensor | None = None
     """``(*B,)`` control steps from now to the meeting that was planned before."""
     lost: Lost | None = None
@@ -49,9 +49,9 @@ class GoalSearch(Protocol):
         """Choose a meeting.
 
         Args:
-            forecast: of the target, ``(*B, F, 3)`` [m, world].
-            target_pos: ``(*B, 3)`` [m, world], the target now.
-            eta: maps goals (*B, K, 3) to arrivals (*B, K).
+            forecast: of the target, ``(*B, F, D)`` [m, world].
+            target_pos: ``(*B, D)`` [m, world], the target now.
+            eta: maps goals (*B, K, D) to arrivals (*B, K).
             context: what else is known.
         """
         ...

@@ -70,8 +70,8 @@ class SoftExactSearch:
 
         Args:
             forecast: of the target in 1 … F control steps.
-            target_pos: ``(*B, 3)`` [m, world], the target now.
-            eta: maps goals ``(*B, K, 3)`` to arrivals ``(*B, K)``; called once, with ``estimator="soft"``.
+            target_pos: ``(*B, D)`` [m, world], the target now.
+            eta: maps goals ``(*B, K, D)`` to arrivals ``(*B, K)``; called once, with ``estimator="soft"``.
             context: of which it reads when a target is lost.
 
         Returns:
@@ -130,7 +130,7 @@ class SoftCornerSearch:
         path = torch.cat([now, forecast.path], dim=-2)
         here = eta(now, estimator="soft").steps
         half_edge = torch.linalg.vector_norm(between(path, here) - now, dim=-1, keepdim=True)
-        corners = now + half_edge * path.new_tensor(CORNERS)
+        corners = now + half_edge * path.new_tensor(CORNERS)[:, : path.shape[-1]]
         steps, never = eta(corners, estimator="soft")[:2]
         never = never.to(steps.dtype)
         met = between(path, steps)
@@ -153,13 +153,13 @@ def _apart(candidates: Candidates) -> Tensor:
 
 
 def between(path: Tensor, steps: Tensor) -> Tensor:
-    """Places (*B, K, 3) on ``path`` (*B, T, 3) at ``steps`` (*B, K), linear between whole steps, cut to 0 … T - 1.
+    """Places (*B, K, D) on ``path`` (*B, T, D) at ``steps`` (*B, K), linear between whole steps, cut to 0 … T - 1.
 
     The gradient reaches path and steps, but not steps that are cut.
     """
     last = path.shape[-2] - 1
     inside = steps.clamp(0.0, float(last))
     before = inside.detach().floor().clamp(max=max(last - 1, 0))
-    index = before.to(torch.int64).unsqueeze(-1).expand(*steps.shape, 3)
+    index = before.to(torch.int64).unsqueeze(-1).expand(*steps.shape, path.shape[-1])
     start, end = path.gather(-2, index), path.gather(-2, (index + 1).clamp(max=last))
     return torch.lerp(start, end, (inside - before).unsqueeze(-1))

@@ -19,6 +19,7 @@ from torchdyn_plan.kinematics.components import Vector, damped_least_squares
 from torchdyn_plan.kinematics.descent import evaluate
 from torchdyn_plan.kinematics.dls import dls_step, limited_step
 from torchdyn_plan.kinematics.fused import Columns, Fused, filled
+from torchdyn_plan.nets.analytic_arrival import AnalyticArrival
 from torchdyn_plan.planners.memory import remember, warn_of_loss
 from torchdyn_plan.planners.protocol import read
 from torchdyn_plan.planners.static.approach import Approach, StraightToGoal
@@ -127,6 +128,16 @@ class IKPlanner(Precise, StaticPlannerModule):
         step = torch.full(batch, self.PATH_LENGTH, dtype=torch.int64, device=like.device)
         path = Path(like.new_zeros(*batch, self.arm.num_joints), step, torch.zeros_like(like))
         return dict(zip(PATH_NAMES, path, strict=True))
+
+    def arrival_model(self) -> AnalyticArrival:
+        """When its joints are at a goal: ``robot_state`` is to begin with the joints' positions and speeds.
+
+        It takes them for as quick to speed up as the planner is to brake, within ``1 / gain`` control steps; a robot
+        that lags, or is told its limits, has an `AnalyticArrival` of its own.
+        """
+        speed = self._limit / self.control_step
+        acceleration = speed * (self.gain / self.control_step)
+        return AnalyticArrival(self, speed=speed, acceleration=acceleration, control_step=self.control_step)
 
     def part_settings(self) -> dict[str, Any]:
         """Arguments that make the same planner."""

@@ -1,4 +1,4 @@
-"""The trivial static planner of a tool that is pulled along x, y and z: straight at the goal, slower when near."""
+"""The trivial static planner of a tool that is pulled along each axis: straight at the goal, slower when near."""
 
 from __future__ import annotations
 
@@ -8,7 +8,8 @@ import torch
 from tensordict import TensorDictBase
 
 from torchdyn_plan import keys
-from torchdyn_plan.checks import check_finite, check_number, check_trailing_shape
+from torchdyn_plan.checks import POINT_SIZES, check_finite, check_number, check_points, check_trailing_shape
+from torchdyn_plan.errors import InputError
 from torchdyn_plan.planners.protocol import read
 from torchdyn_plan.planners.static.base import StaticPlannerModule
 
@@ -16,15 +17,16 @@ from torchdyn_plan.planners.static.base import StaticPlannerModule
 class ProportionalController(StaticPlannerModule):
     """Pulls the tool towards ``goal``: action = gain · (goal - tool), each axis cut to ±1.
 
-    Reads ``tool_pos`` (*B, 3) and ``goal`` (*B, 3) [m, world], writes ``action`` (*B, ``action_size``), whose further
+    Reads ``tool_pos`` (*B, D) and ``goal`` (*B, D) [m, world], writes ``action`` (*B, ``action_size``), whose further
     entries are 0. It remembers nothing, and a row's action depends on that row alone, whatever the batch.
     """
 
-    def __init__(self, *, gain: float, action_size: int = 3) -> None:
-        """Pull with ``gain`` [1/m]; the first three of ``action_size`` entries are along x, y and z."""
+    def __init__(self, *, gain: float, action_size: int | None = None) -> None:
+        """Pull with ``gain`` [1/m]; the first D of ``action_size`` entries, D for None, are along its axes."""
         super().__init__()
         check_number("gain", gain, minimum=0.0)
-        check_number("action_size", action_size, minimum=3, integer=True)
+        if action_size is not None:
+            check_number("action_size", action_size, minimum=POINT_SIZES[0], integer=True)
         self.gain, self.action_size = gain, action_size
         self.in_keys = [keys.TOOL_POS, keys.GOAL]
         self.out_keys = [keys.ACTION]
@@ -32,11 +34,14 @@ class ProportionalController(StaticPlannerModule):
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         """Write ``action``; raises `InputError` where a key is missing, a shape is wrong or the goal holds a NaN."""
         tool_pos, goal = (read(tensordict, key, "ProportionalController") for key in self.in_keys)
-        check_trailing_shape(keys.TOOL_POS, tool_pos, 3)
-        check_trailing_shape(keys.GOAL, goal, 3)
+        size = check_points(keys.TOOL_POS, tool_pos)
+        check_trailing_shape(keys.GOAL, goal, size)
         check_finite(keys.GOAL, goal)
+        wide = size if self.action_size is None else self.action_size
+        if wide < size:
+            raise InputError(f"action_size must be at least the {size} coordinates of goal, got {wide}")
         pull = ((goal - tool_pos) * self.gain).clamp(-1.0, 1.0)
-        tensordict.set(keys.ACTION, torch.nn.functional.pad(pull, (0, self.action_size - 3)))
+        tensordict.set(keys.ACTION, torch.nn.functional.pad(pull, (0, wide - size)))
         return tensordict
 
     def part_settings(self) -> dict[str, Any]:

@@ -112,7 +112,7 @@ def corner(parts: PlannerParts) -> Any:
     """The paper's planner."""
     from torchdyn_plan.planners import DynamicPlanner
 
-    return DynamicPlanner(parts.static, parts.forecaster, parts.eta, **common(parts)).eval()
+    return DynamicPlanner.paper(parts.static, parts.forecaster, parts.eta, **common(parts)).eval()
 
 
 def oracle(parts: PlannerParts) -> Any:

@@ -136,14 +136,14 @@ def corner(parts: PlannerParts) -> Any:
     """The paper's planner, with arrival times as the paper has them: none is *never*."""
     from torchdyn_plan.planners import DynamicPlanner
 
-    return DynamicPlanner(parts.static, parts.forecaster, parts.nearest_eta, **going(parts)).eval()
+    return DynamicPlanner.paper(parts.static, parts.forecaster, parts.nearest_eta, **going(parts)).eval()
 
 
 def corner_never(parts: PlannerParts) -> Any:
     """The paper's planner, with arrival times that know *never*."""
     from torchdyn_plan.planners import DynamicPlanner
 
-    return DynamicPlanner(parts.static, parts.forecaster, parts.eta, **going(parts)).eval()
+    return DynamicPlanner.paper(parts.static, parts.forecaster, parts.eta, **going(parts)).eval()
 
 
 def oracle(parts: PlannerParts) -> Any:
@@ -164,7 +164,7 @@ def exact(parts: PlannerParts) -> Any:
     """The paper's planner with a search of the whole forecast."""
     from torchdyn_plan.planners import DynamicPlanner, ExactSearch
 
-    return DynamicPlanner(parts.static, parts.forecaster, parts.eta, search=ExactSearch(), **going(parts)).eval()
+    return DynamicPlanner.paper(parts.static, parts.forecaster, parts.eta, search=ExactSearch(), **going(parts)).eval()
 
 
 def wait_and_drop(parts: PlannerParts) -> Any:
@@ -189,7 +189,11 @@ def waits_and_drops(parts: PlannerParts, forecaster: Any, eta: Any) -> Any:
 
     scene = trapper_scene(parts.task.scene)
     # Candidates are 5 steps apart: a plan every 5 steps keeps them on the same places, and so the waiting tool still.
-    own = {"search": waiting_search(scene), "schedule": ReplanSchedule.every(5), "maneuver": WaitAndDrop.of(scene)}
+    own = {
+        "search": waiting_search(scene),
+        "schedule": ReplanSchedule.every(5, first_step=13),
+        "maneuver": WaitAndDrop.of(scene),
+    }
     return DynamicPlanner(parts.static, forecaster, eta, **own, **common(parts)).eval()
 
 

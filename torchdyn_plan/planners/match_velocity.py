@@ -1,0 +1,183 @@
+"""A maneuver that touches a moving target without a jolt: where it is, and as fast as it is."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from enum import IntEnum
+from typing import Any, ClassVar, NamedTuple
+
+import torch
+from torch import Tensor
+
+from torchdyn_plan.checks import check_number, check_vector
+from torchdyn_plan.errors import InputError
+from torchdyn_plan.planners.observation import Observation
+from torchdyn_plan.planners.plan import Plan
+from torchdyn_plan.planners.search.exact import ExactSearch
+
+
+class MatchPhase(IntEnum):
+    """What `MatchVelocity` is about, as `MatchVelocity.phase` tells."""
+
+    HOVER = 0
+    """It waits above the meeting place, or is on the way there."""
+    DOWN = 1
+    """It takes on the target's velocity and comes down."""
+    HOLD = 2
+    """It is on the target and goes with it: the time for a gripper to close."""
+    LIFT = 3
+    """It rises, comes to rest, and stays there until its row starts afresh."""
+
+
+class MatchState(NamedTuple):
+    """Where each row stands."""
+
+    match_step: Tensor
+    """``(*B,)`` int64 control steps since it began to come down, -1 before."""
+    match_from: Tensor
+    """``(*B, D)`` where the tool came down from, or rises from [m, world]."""
+    match_velocity: Tensor
+    """``(*B, D)`` with which it rises [m per control step]."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class MatchVelocity:
+    """Hovers above the meeting place, comes down with the target's velocity, holds, and lifts.
+
+    ``descent_steps`` = n before the meeting, the tool begins to follow the target's path p from where it is, x_0:
+
+        x(k) = x_0 + w(k) (p(k) - x_0),  w(k) = 10 s³ - 15 s⁴ + 6 s⁵,
+
+    along the ``axis`` with another s than across it, so that it flies along with the target before it comes down. As w
+    is 1 and its derivatives are 0 at the end, x(n) = p(n) and x'(n) = p'(n). Then it follows the path for
+    ``hold_steps``, and rises while it slows down. All of it is said through the goal.
+
+    The plan's goal is where it waits, and its time that of the contact: `search` makes a search that finds such plans.
+    `MatchPhase` is what ``phase`` makes of ``plan.match_step``: a gripper closes in `MatchPhase.HOLD`.
+    """
+
+    hover: float
+    """How far from the target it waits, along the axis, by its `search` [m]."""
+    descent_steps: int
+    """Control steps from when it begins to follow the target to the contact."""
+    hold_steps: int = 0
+    """Control steps for which it stays on the target."""
+    lift: float | None = None
+    """How far it rises after that, along the axis; as far as it hovers for None [m]."""
+    lift_steps: int | None = None
+    """Control steps in which it rises and comes to rest; ``descent_steps`` for None."""
+    lead_steps: int = 1
+    """Control steps that a tool lags behind a goal that moves: goals are so much ahead."""
+    along_by: float = 0.7
+    """Share of the descent by which it flies along with the target, across the axis."""
+    down_after: float = 0.4
+    """Share of the descent after which it comes down, along the axis."""
+    within: float = math.inf
+    """A tool farther than this from the target at contact has missed it, and hovers again [m]."""
+    axis: tuple[float, ...] | None = None
+    """Direction from the target to where the tool hovers, of any length; up for None, along the last coordinate."""
+
+    State: ClassVar[type[MatchState]] = MatchState
+
+    def __post_init__(self) -> None:
+        check_number("hover", self.hover, minimum=0.0)
+        check_number("descent_steps", self.descent_steps, minimum=1, integer=True)
+        for name in ("hold_steps", "lead_steps"):
+            check_number(name, getattr(self, name), minimum=0, integer=True)
+        if self.lift is not None:
+            check_number("lift", self.lift, minimum=0.0)
+        if self.lift_steps is not None:
+            check_number("lift_steps", self.lift_steps, minimum=1, integer=True)
+        check_number("along_by", self.along_by, minimum=1e-3, maximum=1.0)
+        check_number("down_after", self.down_after, minimum=0.0, maximum=0.999)
+        if not self.within > 0.0:
+            raise InputError(f"within must be positive, got {self.within!r}")
+        if self.axis is not None:
+            object.__setattr__(self, "axis", check_vector("axis", self.axis))
+            if not any(self.axis):
+                raise InputError(f"axis must be a direction, got {self.axis!r}")
+
+    @property
+    def lookahead(self) -> int:
+        """Positions of the target's path that it reads: that of its goal, and the next one."""
+        return self.lead_steps + 2
+
+    def search(self, *, coordinates: int = 3, **settings: Any) -> ExactSearch:
+        """A search for the earliest meeting that leaves the tool time to come down from where it hovers.
+
+        Args:
+            coordinates: D of places.
+            settings: of `ExactSearch`, in place of those that are chosen here: all steps of the forecast are looked at,
+                and a meeting that is planned is kept unless another is 50 control steps earlier.
+        """
+        offset = tuple((self.hover * self._up(torch.zeros(coordinates, dtype=torch.float64))).tolist())
+        own: dict[str, Any] = {"stride": 1, "first": 1, "offset": offset, "descent_steps": float(self.descent_steps)}
+        own |= {"margin": 1.0, "switching_cost": 1.0}
+        return ExactSearch(**(own | settings))
+
+    def start(self, observation: Observation) -> MatchState:
+        """Nothing has begun."""
+        zero = torch.zeros_like(observation.tool_pos)
+        return MatchState(torch.full_like(observation.step_count, -1), observation.tool_pos, zero)
+
+    def __call__(
+        self, plan: Plan, observation: Observation, holds: Tensor, state: MatchState
+    ) -> tuple[Tensor, MatchState]:
+        """Above the meeting place, down with the target, on it, or up again."""
+        tool_pos, up = observation.tool_pos, self._up(observation.tool_pos)
+        place, later = plan.ahead(self.lookahead)[..., -2:, :].unbind(-2)
+        step = self._next(plan, observation, holds, state.match_step)
+        begins, rises = step == 0, step == self.descent_steps + self.hold_steps
+        came = torch.where(begins.unsqueeze(-1), tool_pos, state.match_from)
+        came = torch.where(rises.unsqueeze(-1), place, came)
+        velocity = torch.where(rises.unsqueeze(-1), later - place, state.match_velocity)
+        phase = self.phase(step).unsqueeze(-1)
+        goal = torch.where(phase == MatchPhase.DOWN, self._down(step, came, place, up), plan.goal)
+        goal = torch.where(phase == MatchPhase.HOLD, place, goal)
+        goal = torch.where(phase == MatchPhase.LIFT, self._lifted(step, came, velocity, up), goal)
+        return goal, MatchState(step, came, velocity)
+
+    def phase(self, match_step: Tensor) -> Tensor:
+        """`MatchPhase` of ``plan.match_step`` (*B,): ``(*B,)`` int64."""
+        begun, on = match_step >= 0, match_step >= self.descent_steps
+        return begun.long() + on + (match_step >= self.descent_steps + self.hold_steps)
+
+    def _next(self, plan: Plan, observation: Observation, holds: Tensor, before: Tensor) -> Tensor:
+        """Control steps since the descent began, ``(*B,)``, a step after ``before`` (*B,)."""
+        step = torch.where(before >= 0, before + 1, before)
+        away = torch.linalg.vector_norm(observation.tool_pos - observation.target_pos, dim=-1)
+        step = step.masked_fill((step == self.descent_steps) & (away > self.within), -1)
+        due = plan.reachable & (plan.age >= 0) & ~holds & (plan.arrival_steps <= self.descent_steps)
+        return step.masked_fill((step < 0) & due, 0)
+
+    def _down(self, step: Tensor, came: Tensor, place: Tensor, up: Tensor) -> Tensor:
+        """Goal ``(*B, D)`` on the way from where it ``came`` (*B, D) to ``place`` (*B, D), ``step`` (*B,) into it."""
+        share = ((step + self.lead_steps) / self.descent_steps).to(came.dtype).clamp(0.0, 1.0).unsqueeze(-1)
+        way = place - came
+        along = (way * up).sum(-1, keepdim=True) * up
+        flown = smooth(share / self.along_by)
+        lowered = smooth((share - self.down_after) / (1.0 - self.down_after))
+        return came + flown * (way - along) + lowered * along
+
+    def _lifted(self, step: Tensor, came: Tensor, velocity: Tensor, up: Tensor) -> Tensor:
+        """Goal ``(*B, D)`` on the way up from where it ``came`` (*B, D), with ``velocity`` (*B, D) at first."""
+        steps = self.descent_steps if self.lift_steps is None else self.lift_steps
+        passed = (step - self.descent_steps - self.hold_steps).to(came.dtype).clamp(0.0, float(steps)).unsqueeze(-1)
+        gone = velocity * (passed - 0.5 * passed.square() / steps)
+        return came + gone + (self.hover if self.lift is None else self.lift) * smooth(passed / steps) * up
+
+    def _up(self, like: Tensor) -> Tensor:
+        """The axis, ``(D,)`` of length 1, of the type of ``like`` (*B, D)."""
+        size = like.shape[-1]
+        if self.axis is None:
+            return torch.eye(size, dtype=like.dtype, device=like.device)[-1]
+        if len(self.axis) != size:
+            raise InputError(f"axis has {len(self.axis)} numbers, but places have {size} coordinates")
+        return torch.nn.functional.normalize(like.new_tensor(self.axis), dim=-1)
+
+
+def smooth(share: Tensor) -> Tensor:
+    """10 s³ - 15 s⁴ + 6 s⁵ of ``share`` (*B,) cut to 0 … 1: from 0 to 1, its first two derivatives 0 at both ends."""
+    s = share.clamp(0.0, 1.0)
+    return s**3 * (10.0 + s * (6.0 * s - 15.0))

@@ -1,0 +1,62 @@
+"""A static planner for a point that has limits of speed and acceleration, and is told a velocity: a base, a drone."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import torch
+from tensordict import TensorDictBase
+
+from torchdyn_plan import keys
+from torchdyn_plan.checks import check_finite, check_points, check_trailing_shape
+from torchdyn_plan.nets.point_arrival import PointArrival
+from torchdyn_plan.planners.protocol import read
+from torchdyn_plan.planners.static.base import StaticPlannerModule
+
+NEAR = 1e-9
+"""Nearer to its goal than this a point has no direction to go [m]."""
+FADE = 0.25
+"""Share of the last bit of way that is covered in a control step."""
+
+
+class PointPlanner(StaticPlannerModule):
+    """Sends a point straight to ``goal`` as fast as it may; ``action`` is its velocity as a fraction of its speed.
+
+    Reads ``tool_pos`` (*B, D) and ``goal`` (*B, D) [m, world], writes ``action`` (*B, D) of size 0 to 1. One that stops
+    slows down as its acceleration lets it. It remembers nothing.
+    """
+
+    def __init__(
+        self, *, speed: float, acceleration: float, control_step: float, stops: bool = True, radius: float = 0.0
+    ) -> None:
+        """Go with at most ``speed``; arguments as of `torchdyn_plan.nets.PointArrival`."""
+        super().__init__()
+        self.limits = PointArrival(
+            speed=speed, acceleration=acceleration, control_step=control_step, stops=stops, radius=radius
+        )
+        self.in_keys = [keys.TOOL_POS, keys.GOAL]
+        self.out_keys = [keys.ACTION]
+
+    def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
+        """Write ``action``; raises `InputError` where a key is missing, a shape is wrong or the goal holds a NaN."""
+        tool_pos, goal = (read(tensordict, key, "PointPlanner") for key in self.in_keys)
+        check_trailing_shape(keys.GOAL, goal, check_points(keys.TOOL_POS, tool_pos))
+        check_finite(keys.GOAL, goal)
+        offset, limits = goal - tool_pos, self.limits
+        far = torch.linalg.vector_norm(offset, dim=-1, keepdim=True)
+        fastest = torch.full_like(far, limits.speed).masked_fill(far <= NEAR, 0.0)
+        if limits.stops:
+            # It brakes a step later than it sees: v²/2a + v dt + a dt²/2 ≤ way. The last bit is left to fade.
+            braked = limits.acceleration * limits.control_step
+            fading = FADE * (far / limits.control_step).clamp(max=braked)
+            fastest = fastest.minimum(((2.0 * limits.acceleration * far).sqrt() - braked).maximum(fading))
+        tensordict.set(keys.ACTION, offset / far.clamp_min(NEAR) * (fastest / limits.speed))
+        return tensordict
+
+    def arrival_model(self) -> PointArrival:
+        """When it is at a goal; ``robot_state`` is to begin with place and velocity."""
+        return self.limits
+
+    def part_settings(self) -> dict[str, Any]:
+        """Arguments that make the same planner."""
+        return self.limits.part_settings()
