@@ -99,7 +99,7 @@ def test_gradient_is_finite_for_a_target_at_rest(network):
     ("history", "message"),
     [
         (torch.zeros(2, 23, 3), r"target_history.*24, 3.*\(2, 23, 3\)"),
-        (torch.zeros(2, 24, 2), r"target_history.*\(2, 24, 2\)"),
+        (torch.zeros(2, 24, 4), r"target_history.*\(2, 24, 4\)"),
         (torch.full((2, 24, 3), float("nan")), "target_history must be finite"),
         (torch.zeros(2, 24, 3, device="meta"), "target_history is on meta"),
     ],

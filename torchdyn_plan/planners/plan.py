@@ -66,18 +66,20 @@ class LostBelow:
 
     def seen(self, target_pos: Tensor) -> Tensor:
         """As `Lost.seen`."""
-        return height_of(target_pos) < self.seen_below
+        if target_pos.shape[-1] != 3:
+            raise no_height(target_pos)
+        return target_pos[..., 2] < self.seen_below
 
     def forecast(self, path: Tensor) -> Tensor:
         """As `Lost.forecast`."""
-        return height_of(path) <= self.forecast_below
+        if path.shape[-1] != 3:
+            raise no_height(path)
+        return path[..., 2] <= self.forecast_below
 
 
-def height_of(place: Tensor) -> Tensor:
-    """Height ``(*B,)`` of places (*B, 3) [m]; raises `InputError` for those in a plane, which have none."""
-    if place.shape[-1] != 3:
-        raise InputError(f"LostBelow needs points of 3 coordinates, got {place.shape[-1]}: in a plane nothing is below")
-    return place[..., 2]
+def no_height(place: Tensor) -> InputError:
+    """The error about places of other than three coordinates, which have no height."""
+    return InputError(f"LostBelow needs points of 3 coordinates, got {place.shape[-1]}: in a plane nothing is below")
 
 
 class Plan(NamedTuple):

@@ -29,11 +29,10 @@ from torchdyn_plan.precision import HALVES
 class DynamicPlanner(ComposedPlanner):
     """Meets a moving target: history → forecast → meeting → goal → action.
 
-    Writes ``goal`` (*B, D) [m, world], ``arrival_steps`` (*B,), what the static planner writes, and under ``plan`` the
-    memory for the next step and each row's `PlanStatus`. A row plans when its schedule says so, and starts afresh at
-    ``step_count`` 0. One that cannot plan, as its input or forecast is no number or its target is lost, holds its tool
-    still and tries again at every step; one whose robot is not seen gets action 0. Points have
-    D coordinates, 2 or 3. Parts: see `ComposedPlanner`.
+    Writes ``goal`` (*B, 3 or 2) [m, world], ``arrival_steps`` (*B,), what the static planner writes, and under ``plan``
+    the memory for the next step and each row's `PlanStatus`. A row plans when its schedule says so, and starts afresh
+    at ``step_count`` 0. One that cannot plan, as its input or forecast is no number or its target is lost, holds its
+    tool still and tries again at each step; one whose robot is not seen gets action 0. Parts: see `ComposedPlanner`.
     """
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:

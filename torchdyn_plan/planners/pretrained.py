@@ -100,6 +100,10 @@ class PretrainedPlanner:
             if isinstance(error, InputError) and parts:
                 raise
             raise WeightsError(f"{str(file)!r} describes no planner that can be made: {error}") from error
+        # A part that is not described would be the default one without a word.
+        missing = sorted(planner.part_settings().keys() - made.keys())
+        if missing:
+            raise WeightsError(f"{str(file)!r} lacks {', '.join(missing)}")
         return _ready(planner.to(device), parts)
 
 
