@@ -19,7 +19,8 @@ import tyro
 from study import Episodes, Row, Setting, Study, measuring, success_of
 
 from torchdyn_plan.envs.sensor import Sensor
-from torchdyn_plan.planners import DynamicPlanner, KalmanTrack, LeastSquaresTrack, Track, TrackedPlanner
+from torchdyn_plan.evaluation.tracks import track_named
+from torchdyn_plan.planners import DynamicPlanner, Track, TrackedPlanner
 from torchdyn_plan.tasks import load_task
 
 TASK = "trapper"
@@ -29,12 +30,10 @@ SENSORS = {
     "5 mm, 60 Hz, 20 ms late": Sensor(noise=0.005, rate=60.0, latency=0.02),
     "5 mm, 30 Hz, 5 % lost, 3 ms jitter": Sensor(noise=0.005, rate=30.0, dropout=0.05, jitter=0.003),
 }
-LEAST_NOISE = 1e-4
-"""A track takes no measurement for better than this [m]: targets do not move as smoothly as its filter says."""
-TRACKS: dict[str, Callable[[float], Track] | None] = {
-    "held": None,
-    "kalman": lambda noise: KalmanTrack(noise=noise),
-    "least_squares": lambda noise: LeastSquaresTrack(noise=noise, window=0.2),
+TRACKS: dict[str, Callable[[Sensor], Track | None]] = {
+    "held": lambda sensor: None,
+    "kalman": lambda sensor: track_named("kalman", sensor),
+    "least_squares": lambda sensor: track_named("least_squares", sensor, window=0.2),
 }
 
 
@@ -58,11 +57,8 @@ class Arguments(Episodes):
 
 def sees_by(planner: DynamicPlanner, track: str, sensor: Sensor, control_step: float) -> Any:
     """``planner`` behind the track of that name, told the noise of ``sensor``."""
-    make = TRACKS[track]
-    if make is None:
-        return planner
-    noise = max(sensor.noise, LEAST_NOISE)
-    return TrackedPlanner(planner, make(noise), control_step=control_step)
+    found = TRACKS[track](sensor)
+    return planner if found is None else TrackedPlanner(planner, found, control_step=control_step)
 
 
 def main(arguments: Arguments) -> None:

@@ -4,10 +4,14 @@ import sys
 from pathlib import Path
 
 import pytest
+import torch
 from matplotlib.image import imread
 
 from tests.menagerie import write as write_menagerie
 from tests.scripts import run
+from torchdyn_plan import DynamicPlanner
+from torchdyn_plan.envs import TrapperEnv
+from torchdyn_plan.planners import Delayed, KalmanTrack, TrackedPlanner
 
 EXAMPLES = Path(__file__).parent.parent / "examples"
 
@@ -35,6 +39,39 @@ def test_example_runs(name, says, tmp_path):
     ran = run(EXAMPLES / file, *words, cwd=tmp_path)
     assert ran.returncode == 0, ran.stderr
     assert says in ran.stdout
+
+
+def test_the_real_time_loop_traps_what_the_same_measurements_trap_without_threads(tmp_path):
+    ran = run(EXAMPLES / "05_real_time_loop.py", "--simulated", cwd=tmp_path)
+    assert ran.returncode == 0, ran.stderr
+    trapped, steps = real_time_loop_without_threads(balls=4)
+    assert f"{trapped} of 4 balls trapped" in ran.stdout
+    assert f"of {steps} steps took" in ran.stdout
+    assert trapped >= 2
+
+
+def real_time_loop_without_threads(balls):
+    """Balls trapped and control steps of example 05, simulated, with every measurement made in the loop itself."""
+    env = TrapperEnv(velocity=2.0, seed=0, split="dev", num_threads=1)
+    inner = DynamicPlanner.from_pretrained("trapper-ik-wait_and_drop").with_parts(delivery=Delayed(2))
+    planner = TrackedPlanner(inner, KalmanTrack(noise=0.005), control_step=0.004)
+    draw, state, ended, trapped, steps = torch.Generator().manual_seed(0), env.reset(), 0, 0, 0
+    pictures = 0
+    with torch.no_grad():
+        while ended < balls:
+            step = int(state["step_count"])
+            pictures = pictures if step else 0
+            state["measured_time"] = torch.full((1, 1), torch.nan)
+            state["measured_pos"] = torch.full((1, 1, 3), torch.nan)
+            # Thirty pictures a second are one in each 8 1/3 steps.
+            if 3 * step >= 25 * pictures:
+                pictures += 1
+                state["measured_time"][0] = 0.004 * step
+                state["measured_pos"][0] = state["target_pos"] + 0.005 * torch.randn(3, generator=draw)
+            stepped, state = env.step_and_maybe_reset(planner(state))
+            ended, trapped = ended + int(stepped["next", "done"]), trapped + int(stepped["next", "trapped"])
+            steps += 1
+    return trapped, steps
 
 
 DRAWS = """

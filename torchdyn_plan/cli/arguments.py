@@ -38,6 +38,36 @@ class Arguments:
 
 
 @dataclass(frozen=True, kw_only=True)
+class TrackArguments:
+    """What a track is told; its own where not given, and not every track has each."""
+
+    noise: float | None = None
+    """Standard deviation of a measurement's error along each axis [m]; the sensor's when not given."""
+    speed: float | None = None
+    """Standard deviation of the speed along each axis of a target of which nothing is known [m/s]."""
+    max_speed: float | None = None
+    """No target moves faster [m/s]."""
+    gate: float | None = None
+    """A measurement fits up to so many standard deviations of what is expected of it."""
+    rebound: float | None = None
+    """Share of the speed that is taken to come back from a bounce."""
+    patience: float | None = None
+    """So long a track is of use without a measurement [s]."""
+    least: int | None = None
+    """Measurements from which on a track is of use."""
+    oldest: float | None = None
+    """A measurement older than the newest one by more than this is not used [s]."""
+    window: float | None = None
+    """Of least_squares: time over which a measurement's weight falls to 1/e [s]."""
+    agility: float | None = None
+    """Of kalman: after t seconds the velocity may have changed by this times the root of t [m/s² per √Hz]."""
+    accelerates: bool | None = None
+    """Of kalman: whether the acceleration is constant, and not the velocity."""
+    acceleration: float | None = None
+    """Of kalman that accelerates: standard deviation of an acceleration of which nothing is known [m/s²]."""
+
+
+@dataclass(frozen=True, kw_only=True)
 class EpisodeArguments(Arguments):
     """Which episodes are run, and by which planners."""
 
@@ -59,6 +89,8 @@ class EpisodeArguments(Arguments):
     latency_ms: float = 0.0
     """Time by which every plan comes late, whole control steps; planners that make no plans have none."""
     sensor: Any = None
+    track: str = "none"
+    track_settings: Any = None
     compensate: bool = True
     """Tell the planners of that time, so that they plan for the moment when the plan is there."""
     overwrite: bool = False

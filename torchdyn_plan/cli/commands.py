@@ -30,7 +30,7 @@ from torchdyn_plan.tasks import Task
 
 if TYPE_CHECKING:
     from torchdyn_plan.envs.sensor import Sensor
-    from torchdyn_plan.planners import Delivery
+    from torchdyn_plan.planners import Delivery, Track
 
 
 def run(task: Task | None, arguments: Arguments) -> None:
@@ -186,6 +186,7 @@ COMMANDS: dict[type[Arguments], Callable[[Any, Any], None]] = {
 
 def _shared(task: Task, arguments: EpisodeArguments) -> dict[str, Any]:
     """What evaluations and sweeps are given alike."""
+    sensor = _sensor(arguments)
     return {
         "static": arguments.static,
         "episodes": arguments.episodes,
@@ -194,7 +195,8 @@ def _shared(task: Task, arguments: EpisodeArguments) -> dict[str, Any]:
         "num_envs": arguments.num_envs,
         "num_threads": arguments.threads,
         "delivery": _delivery(task, arguments),
-        "sensor": _sensor(arguments),
+        "sensor": sensor,
+        "track": _track(arguments, sensor),
         "weights": arguments.weights,
         "overwrite": arguments.overwrite,
         **asdict(arguments.settings),
@@ -207,6 +209,14 @@ def _sensor(arguments: EpisodeArguments) -> Sensor | None:
 
     sensor = Sensor(**asdict(arguments.sensor))
     return None if sensor.is_exact else sensor
+
+
+def _track(arguments: EpisodeArguments, sensor: Sensor | None) -> Track | None:
+    """What becomes of the measurements before planners see them; None if nothing does."""
+    from torchdyn_plan.evaluation.tracks import track_named
+
+    settings = {name: value for name, value in asdict(arguments.track_settings).items() if value is not None}
+    return track_named(arguments.track, sensor, **settings)
 
 
 def _delivery(task: Task, arguments: EpisodeArguments) -> Delivery | None:

@@ -19,6 +19,7 @@ from torchdyn_plan.cli.arguments import (
     PolicyArguments,
     ReplanArguments,
     SweepArguments,
+    TrackArguments,
 )
 from torchdyn_plan.envs.sensor import Sensor
 from torchdyn_plan.errors import InputError
@@ -31,6 +32,10 @@ FITTED = {
     "nearest_eta": "The same as the paper has it: times until the robot is as near as it can come, and no *never*.",
 }
 """Networks that are fitted to data, and what ``--help`` says of them."""
+
+TRACKS = ("none", "least_squares", "kalman")
+"""Tracks by name; tests hold them against `torchdyn_plan.evaluation.tracks`, which takes long to import."""
+TRACK_TEXT = "Filter between sensor and planner; with none planners see the newest measurement, held."
 
 
 TRACKS = (
@@ -136,6 +141,8 @@ def _episode_form(base: type[EpisodeArguments], task: Task, named: str, **own: A
         static=_static_option(task, "Static planner that drives the robot."),
         settings=_group(_settings_form(task)),
         sensor=_prefixed(_plain(Sensor)),
+        track=_option(str, TRACK_TEXT, choices=TRACKS, default=TRACKS[0]),
+        track_settings=_prefixed(TrackArguments, "track"),
         **own,
     )
 
@@ -206,9 +213,14 @@ def _group(kind: type[Any]) -> tuple[Any, Any]:
     return typing.Annotated[kind, tyro.conf.OmitArgPrefixes], dataclasses.field(default_factory=kind)
 
 
-def _prefixed(kind: type[Any]) -> tuple[Any, Any]:
-    """Type and field of the options that the dataclass ``kind`` has, behind the field's name and a point."""
-    return kind, dataclasses.field(default_factory=kind)
+def _prefixed(kind: type[Any], prefix: str | None = None) -> tuple[Any, Any]:
+    """Type and field of the options that the dataclass ``kind`` has, behind a ``prefix`` and a point.
+
+    The prefix is the field's name for None.
+    """
+    import tyro
+
+    return typing.Annotated[kind, tyro.conf.arg(name=prefix)], dataclasses.field(default_factory=kind)
 
 
 def _form(base: type[Any] | None, summary: str = "", **options: tuple[Any, Any]) -> type[Any]:

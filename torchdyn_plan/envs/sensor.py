@@ -45,6 +45,12 @@ class Sensor:
         """Whether it shows the truth at every control step."""
         return self == type(self)()
 
+    @property
+    def deviation(self) -> float:
+        """Standard deviation of what is measured along each axis, that of rounding to whole grains included [m]."""
+        # What is rounded is off by anything up to half a grain, alike.
+        return math.hypot(self.noise, self.quantisation / math.sqrt(12.0))
+
     def slots(self, control_step: float) -> int:
         """Measurements that can come within a control step [s]; of more, as jitter may bring, the first are lost."""
         regular = math.ceil(control_step * (self.rate or 1.0 / control_step) - 1e-9)

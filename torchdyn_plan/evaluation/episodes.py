@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any
 
 import torch
@@ -14,7 +14,7 @@ from torch import Tensor
 from torchdyn_plan import keys
 from torchdyn_plan.envs.moving_target import MovingTargetEnv
 from torchdyn_plan.envs.sensor import Sensor
-from torchdyn_plan.evaluation.results import NO_CAUSE, EpisodeOutcomes
+from torchdyn_plan.evaluation.results import NO_CAUSE, TRACK, TRACK_COUNTS, EpisodeOutcomes
 from torchdyn_plan.evaluation.traces import Trace, TraceLog, true_target
 from torchdyn_plan.progress import progress_bar
 from torchdyn_plan.tasks.task import Task, Truth, Verdict
@@ -40,6 +40,8 @@ class EpisodeLog:
     """First control step at which the success flag was true, int64; -1 for none."""
     replans: Tensor
     """How often the planner planned, int64, of episodes that have ended."""
+    track: dict[str, Tensor] = field(default_factory=dict)
+    """What the planner's track has counted, int64, of episodes that have ended; empty for a planner without one."""
     flags: dict[str, Tensor]
     """The environment's other flags when the episode ended, bool, by name."""
     traces: TraceLog | None
@@ -96,6 +98,10 @@ class EpisodeLog:
             flag[episode] = after[name].squeeze(-1)[rows]
         replans = stepped.get((keys.PLAN, "replans"), None)
         self.replans[episode] = 0 if replans is None else replans[rows]
+        for name in (f"{TRACK}{count}" for count in TRACK_COUNTS):
+            counted = stepped.get((keys.PLAN, name), None)
+            if counted is not None:
+                self.track.setdefault(name, torch.zeros_like(self.replans))[episode] = counted[rows]
         if self.traces is not None:
             self.traces.end(stepped, rows)
         self.order.append(episode)
@@ -255,7 +261,7 @@ def run_episodes(
         replans=log.replans,
         solvable=truth.solvable,
         flags=log.flags | dict(verdict.flags),
-        evidence=verdict.evidence,
+        evidence=dict(verdict.evidence) | log.track,
         cause=verdict.cause,
         causes=task.causes,
         seconds=seconds,

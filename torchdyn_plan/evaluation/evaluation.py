@@ -16,7 +16,7 @@ from torchdyn_plan.evaluation.report import format_table
 from torchdyn_plan.evaluation.results import EpisodeOutcomes, ResultRow, write_results
 from torchdyn_plan.evaluation.study import Planners, Study
 from torchdyn_plan.files import check_writable_folder
-from torchdyn_plan.planners import Delivery
+from torchdyn_plan.planners import Delivery, Track
 from torchdyn_plan.tasks.task import Task, load_task
 
 
@@ -67,6 +67,7 @@ def evaluate(
     num_threads: int = 0,
     delivery: Delivery | None = None,
     sensor: Sensor | None = None,
+    track: Track | None = None,
     weights: str | Path | None = None,
     other_scene: bool = False,
     out: str | Path | None = None,
@@ -89,6 +90,8 @@ def evaluate(
         delivery: how plans come into use, `torchdyn_plan.planners.Delayed` for one; planners that make no plans have
             none.
         sensor: how targets are measured; exactly for None.
+        track: what becomes of the measurements before planners see them, `torchdyn_plan.planners.KalmanTrack` for one;
+            planners see the newest one, held from step to step, for None.
         weights: folder of the networks of named planners, as ``train`` leaves it; those that ship for None.
         other_scene: let planners of another scene play, too.
         out: folder in which the results are saved as soon as they are there; it is looked at before anything runs.
@@ -112,6 +115,7 @@ def evaluate(
         weights=weights,
         delivery=delivery,
         sensor=sensor,
+        track=track,
         other_scene=other_scene,
         episodes=episodes,
         split=split,

@@ -23,7 +23,7 @@ class Column(NamedTuple):
 def format_table(task: Task, rows: Sequence[ResultRow]) -> str:
     """One aligned table of text: a line a row, rates in per cent, the paper's figure beside ours, ``–`` for none."""
     varying = _varying(rows)
-    columns = [*_names(rows, varying), *_rates(task, rows), *_causes(task, rows), *_measures(rows)]
+    columns = [*_names(rows, varying), *_rates(task, rows), *_causes(task, rows), *_measures(rows), *_track(rows)]
     lines = [[column.head for column in columns], *([column.cell(row) for column in columns] for row in rows)]
     widths = [max(map(len, cells)) for cells in zip(*lines, strict=True)]
     first, *others = (_align(line, widths) for line in lines)
@@ -84,6 +84,12 @@ def _measures(rows: Sequence[ResultRow]) -> Iterator[Column]:
     """The task's further figures."""
     for name in dict.fromkeys(name for row in rows for name in row.measures):
         yield Column(_spaced(name), lambda row, name=name: _number(row.measures.get(name), 2))
+
+
+def _track(rows: Sequence[ResultRow]) -> Iterator[Column]:
+    """What tracks made of measurements."""
+    for name in dict.fromkeys(name for row in rows for name in row.track):
+        yield Column(f"track {name}", lambda row, name=name: _number(row.track.get(name), 1))
 
 
 def _title(task: Task, rows: Sequence[ResultRow], varying: Sequence[str]) -> str:

@@ -23,6 +23,8 @@ from torchdyn_plan.versions import library_versions, machine
 
 NO_CAUSE = -1
 """Code of an episode that did not fail, or whose task names no causes."""
+TRACK, TRACK_COUNTS = "track_", ("used", "restarts", "rejected")
+"""What a track counts below ``plan``, and in files behind the first of these words."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -40,7 +42,7 @@ class EpisodeOutcomes:
     flags: Mapping[str, Tensor] = field(default_factory=dict)
     """Further outcomes of the task, bool, by name."""
     evidence: Mapping[str, Tensor] = field(default_factory=dict)
-    """What the causes follow from, by name."""
+    """What the causes follow from, and what a track counted, by name."""
     cause: Tensor
     """Index into ``causes`` of what the episode failed of, int64; `NO_CAUSE` for none."""
     causes: tuple[str, ...] = ()
@@ -63,6 +65,16 @@ class EpisodeOutcomes:
     def episodes(self) -> int:
         """Number of episodes E."""
         return self.success.numel()
+
+    @property
+    def track(self) -> dict[str, Tensor]:
+        """Measurements that the planner's track counted, by what became of them; empty for a planner without a track.
+
+        ``used`` ones are those since the target was last out of sight for long, ``restarts`` did not fit the motion
+        before and began another, ``rejected`` ones were of no use.
+        """
+        named = {name: self.evidence.get(f"{TRACK}{name}") for name in TRACK_COUNTS}
+        return {name: count for name, count in named.items() if count is not None}
 
     def to_json(self, task: Task) -> dict[str, Any]:
         """Lists and numbers for a JSON file, in the words of ``task``, the name of each failure's cause among them."""
@@ -181,6 +193,9 @@ class ResultRow:
     """Mean and standard deviation of ``success`` over the repeats of a sweep, as the paper reports; None for one."""
     success_solvable_repeats: tuple[float, float] | None = None
     """The same of ``success_solvable``; None also where a repeat has no solvable episode."""
+    track: dict[str, float] = field(default_factory=dict)
+    """Mean number of measurements an episode by what the planner's track made of them, as `EpisodeOutcomes.track` has
+    them; empty for a planner without a track."""
 
 
 def failure_shares(outcomes: EpisodeOutcomes) -> dict[str, float]:
@@ -214,6 +229,7 @@ def summarize(outcomes: EpisodeOutcomes, *, task: Task, planner: str, static: st
         episodes_per_second=outcomes.episodes / outcomes.seconds if outcomes.seconds > 0 else None,
         paper_success=paper[0],
         paper_success_solvable=paper[1],
+        track={name: count.double().mean().item() for name, count in outcomes.track.items()},
     )
 
 

@@ -9,12 +9,14 @@ from functools import cached_property
 from pathlib import Path
 from typing import Any
 
+from tensordict.nn import TensorDictModuleBase
+
 from torchdyn_plan.checks import check_choice, check_count, check_threads
 from torchdyn_plan.envs.sensor import Sensor
 from torchdyn_plan.errors import InputError
 from torchdyn_plan.evaluation.episodes import Planner, find_truth, run_episodes
 from torchdyn_plan.evaluation.results import EpisodeOutcomes, ResultRow, summarize
-from torchdyn_plan.planners import Delivery, DynamicPlanner, TrackedPlanner
+from torchdyn_plan.planners import Delivery, DynamicPlanner, Track, TrackedPlanner
 from torchdyn_plan.planners.pretrained import planner_digest
 from torchdyn_plan.tasks.task import Settings, Task
 from torchdyn_plan.threads import one_thread
@@ -41,6 +43,8 @@ class Study:
     delivery: Delivery | None = None
     sensor: Sensor | None = None
     """How targets are measured; exactly for None."""
+    track: Track | None = None
+    """What becomes of the measurements before planners see them; they see the newest one, held, for None."""
     progress: bool = True
 
     def __post_init__(self) -> None:
@@ -74,6 +78,8 @@ class Study:
             raise InputError("weights are of planners that are named, but the planners were given themselves")
         if not made:
             raise InputError(f"planners must name at least one of {', '.join(task.planners)}")
+        if study.track is not None:
+            made = {name: _tracked(name, planner, study.track, task) for name, planner in made.items()}
         if not other_scene:
             _check_scenes(task, made)
         if delivery is not None:
@@ -108,8 +114,9 @@ class Study:
         about = {"task": self.task.name, "planners": list(self.planners), "static": self.static}
         # Folders of results from before there were sensors say nothing of them.
         sensor = {} if self.sensor is None or self.sensor.is_exact else {"sensor": self.sensor.told()}
+        track = {} if self.track is None else {"track": self.track.told()}
         whole = {"delivery": delivery, "scene": self.task.digest(), "weights": dict(self.weights)}
-        return about | counts | whole | sensor
+        return about | counts | whole | sensor | track
 
     @cached_property
     def weights(self) -> Mapping[str, str | None]:
@@ -140,6 +147,15 @@ def _check_scenes(task: Task, planners: Mapping[str, Planner]) -> None:
                 f"planner {name!r} belongs to another scene ({scene}) than {task.name} ({here}): "
                 "give other_scene=True to evaluate it all the same"
             )
+
+
+def _tracked(name: str, planner: Planner, track: Track, task: Task) -> TrackedPlanner:
+    """``planner`` behind ``track``; raises `InputError` for one that has a track, or cannot have one."""
+    if isinstance(planner, TrackedPlanner):
+        raise InputError(f"planner {name!r} has a track of its own: give it without, or no track beside it")
+    if not isinstance(planner, TensorDictModuleBase):
+        raise InputError(f"planner {name!r} is no planner of this package, and can have no track")
+    return TrackedPlanner(planner, track, control_step=task.control_step)
 
 
 def _delivered(planner: Planner, delivery: Delivery) -> Planner:

@@ -23,7 +23,7 @@ from torchdyn_plan.evaluation.plots import plot_sweep
 from torchdyn_plan.evaluation.results import EpisodeOutcomes, ResultRow, over_repeats, write_results
 from torchdyn_plan.evaluation.study import Planners, Study
 from torchdyn_plan.files import check_writable_folder, exists, read_json, short_path, write_json
-from torchdyn_plan.planners import Delivery
+from torchdyn_plan.planners import Delivery, Track
 from torchdyn_plan.progress import progress_bar
 from torchdyn_plan.schemas import check_content
 from torchdyn_plan.tasks.task import Settings, Task, load_task
@@ -56,6 +56,7 @@ def sweep(
     num_threads: int = 0,
     delivery: Delivery | None = None,
     sensor: Sensor | None = None,
+    track: Track | None = None,
     weights: str | Path | None = None,
     other_scene: bool = False,
     overwrite: bool = False,
@@ -81,6 +82,7 @@ def sweep(
         num_threads: of the simulation, 0 for all cores.
         delivery: how plans come into use.
         sensor: how targets are measured.
+        track: what becomes of the measurements.
         weights: folder of the networks of named planners.
         other_scene: let planners of another scene play, too.
         overwrite: remove whatever results are in the folder, points of this sweep among them.
@@ -108,6 +110,7 @@ def sweep(
         weights=weights,
         delivery=delivery,
         sensor=sensor,
+        track=track,
         other_scene=other_scene,
         episodes=episodes,
         split=split,

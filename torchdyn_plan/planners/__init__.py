@@ -12,6 +12,7 @@ from torchdyn_plan.planners.delivery import Delayed, Delivery
 from torchdyn_plan.planners.maneuver import GoTo, Maneuver
 from torchdyn_plan.planners.match_velocity import MatchPhase, MatchVelocity
 from torchdyn_plan.planners.observation import Observation
+from torchdyn_plan.planners.pace_and_path import PaceAndPath
 from torchdyn_plan.planners.plan import Lost, LostBelow, Plan, PlanStatus
 from torchdyn_plan.planners.planner import DynamicPlanner, observe
 from torchdyn_plan.planners.pretrained import shipped_planners
@@ -59,6 +60,7 @@ __all__ = [
     "MatchVelocity",
     "Meeting",
     "Observation",
+    "PaceAndPath",
     "Plan",
     "PlanStatus",
     "PointPlanner",

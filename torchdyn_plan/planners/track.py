@@ -6,12 +6,13 @@ remembers is a `TrackState` of tensors, which whoever uses it stores from step t
 
 from __future__ import annotations
 
+import dataclasses
 import math
 from abc import ABC, abstractmethod
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor
@@ -142,6 +143,10 @@ class Track(ABC):
             check_number(name, getattr(self, name), minimum=1e-6)
         check_number("rebound", self.rebound, minimum=0.0, maximum=1.0)
         check_number("least", self.least, minimum=1, integer=True)
+
+    def told(self) -> dict[str, Any]:
+        """Its kind, and every number by name, for files."""
+        return {"kind": type(self).__name__} | dataclasses.asdict(self)
 
     @property
     def order(self) -> int:

@@ -25,6 +25,8 @@ NAMES = tuple(f"track_{field}" for field in TrackState._fields)
 AGE, DEVIATION = "track_age", "track_deviation"
 """Written beside, for people to read: how old the newest measurement is [s], and how far the target may be from where
 it is taken to be: standard deviation along each axis [m]."""
+ANY_HISTORY = 24
+"""Positions of a target's history for planners that read any number of them."""
 SHOWN = (keys.TARGET_POS, keys.TARGET_HISTORY, keys.TARGET_COVARIANCE)
 """What the planner inside is shown in place of what the tensordict holds."""
 
@@ -45,7 +47,7 @@ class TrackedPlanner(PretrainedPlanner, Remembering):
         track: Track,
         *,
         control_step: float,
-        history: int = 24,
+        history: int | None = None,
     ) -> None:
         """Let ``planner`` see by ``track``.
 
@@ -53,10 +55,13 @@ class TrackedPlanner(PretrainedPlanner, Remembering):
             planner: any planner for a moving target.
             track: what becomes of the measurements.
             control_step: time between two steps [s].
-            history: positions H of the target's history; as many as the planner's forecaster reads.
+            history: positions H of the target's history; as many as the planner's forecaster reads for None, and 24
+                where it reads any number, or none.
         """
         super().__init__()
         check_number("control_step", control_step, minimum=1e-6)
+        if history is None:
+            history = getattr(getattr(planner, "forecaster", None), "history", None) or ANY_HISTORY
         check_number("history", history, minimum=2, integer=True)
         if not isinstance(track, Track):
             raise InputError(f"track must be a Track, as KalmanTrack(), got {type(track).__name__}")

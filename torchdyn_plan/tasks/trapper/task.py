@@ -181,6 +181,14 @@ def untrained(parts: PlannerParts) -> Any:
     return waits_and_drops(parts, billiard(scene), arm_arrival(scene, ik_planner(scene)))
 
 
+def pace_and_path(parts: PlannerParts) -> Any:
+    """A rival without training or forecast, by a published idea: the static plan at another pace, and shifted."""
+    from torchdyn_plan.envs.trapper.scene import trapper_scene
+    from torchdyn_plan.tasks.trapper.untrained import pace_and_path
+
+    return pace_and_path(trapper_scene(parts.task.scene), parts.static).eval()
+
+
 def waits_and_drops(parts: PlannerParts, forecaster: Any, eta: Any) -> Any:
     """A planner that waits and drops, by this forecaster and this model of arrivals."""
     from torchdyn_plan.envs.trapper.scene import trapper_scene
@@ -291,8 +299,9 @@ def trapper_task(scene: Scene) -> Task:
             "corner_never": corner_never,
             "recorded_oracle": recorded_oracle,
             "untrained": untrained,
+            "pace_and_path": pace_and_path,
         },
-        rivals=("corner_never", "recorded_oracle", "untrained"),
+        rivals=("corner_never", "recorded_oracle", "untrained", "pace_and_path"),
         truth=partial(truth, scene),
         causes=CAUSES,
         judge=partial(judge, scene),

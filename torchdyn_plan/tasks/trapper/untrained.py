@@ -9,7 +9,7 @@ from torchdyn_plan.nets.analytic_arrival import AnalyticArrival
 
 if TYPE_CHECKING:
     from torchdyn_plan.envs.trapper.scene import TrapperScene
-    from torchdyn_plan.planners import IKPlanner
+    from torchdyn_plan.planners import IKPlanner, PaceAndPath
 
 GIVE = 0.012
 """How far a ball presses a cushion in before it turns back [m]."""
@@ -17,6 +17,10 @@ RESTITUTION, RESTITUTION_DEVIATION = 0.92, 0.03
 """Share of the speed across a cushion that comes back, and how much that differs; read off rolls of the split train."""
 SLIDING = 0.45
 """Deceleration of a ball that has bounced, whose spin is still that of before [m/s²]; about the cloth's friction."""
+TOOL_SPEED = 1.5
+"""Of the box on its way, as a rule; tuned on the split dev [m/s]."""
+DROP_TIME = 0.02
+"""Time in which a box that is above its goal is down; tuned on the split dev [s]."""
 SETTLED = -4.5
 """A tool counts as there so many control steps before its joints have stopped: it is within 15 mm by then."""
 
@@ -53,3 +57,16 @@ def arm_arrival(scene: TrapperScene, joints: IKPlanner, **settings: Any) -> Anal
         "extra_steps": SETTLED,
     }
     return AnalyticArrival(joints, **(own | settings))
+
+
+def pace_and_path(scene: TrapperScene, static: Any, **settings: Any) -> PaceAndPath:
+    """`PaceAndPath` on ``static`` in ``scene``; ``settings`` are those of `PaceAndPath`."""
+    from torchdyn_plan.planners import PaceAndPath
+
+    own: dict[str, Any] = {
+        "speed": TOOL_SPEED,
+        "control_step": scene.control_step,
+        "settle": DROP_TIME,
+        "scene": scene.digest(),
+    }
+    return PaceAndPath(static, **(own | settings))
