@@ -38,7 +38,7 @@ TRACKS = ("none", "least_squares", "kalman")
 TRACK_TEXT = "Filter between sensor and planner; with none planners see the newest measurement, held."
 
 
-TRACKS = (
+RECORDED = (
     "File of recorded tracks to take for paths, .csv, .parquet, .npy or .npz: time [s], x, y and z [m], track. "
     "Nothing is simulated then."
 )
@@ -84,7 +84,7 @@ def command_forms(task: Task, named: str) -> dict[str, type[Arguments]]:
             **_task_options(task, named),
             what=_option(str, "Which data.", choices=("paths", "arrivals"), positional=True),
             static=_static_option(task, "Static planner whose arrivals are measured."),
-            tracks=_option(Path | None, TRACKS, default=None, name="from"),
+            tracks=_option(Path | None, RECORDED, default=None, name="from"),
         ),
     }
 

@@ -60,14 +60,14 @@ class TrackedPlanner(PretrainedPlanner, Remembering):
         """
         super().__init__()
         check_number("control_step", control_step, minimum=1e-6)
-        if history is None:
-            history = getattr(getattr(planner, "forecaster", None), "history", None) or ANY_HISTORY
-        check_number("history", history, minimum=2, integer=True)
+        read_by_forecaster: int = getattr(getattr(planner, "forecaster", None), "history", None) or ANY_HISTORY
+        length = read_by_forecaster if history is None else history
+        check_number("history", length, minimum=2, integer=True)
         if not isinstance(track, Track):
             raise InputError(f"track must be a Track, as KalmanTrack(), got {type(track).__name__}")
         if not isinstance(planner, TensorDictModuleBase):
             raise InputError(f"planner must be a planner of this package, got {type(planner).__name__}")
-        self.planner, self.track, self.control_step, self.history = planner, track, control_step, history
+        self.planner, self.track, self.control_step, self.history = planner, track, control_step, length
         own: list[Any] = [(keys.PLAN, name) for name in NAMES]
         seen = [key for key in planner.in_keys if key not in SHOWN]
         read_keys: list[Any] = list(dict.fromkeys([keys.TARGET_POS, keys.STEP_COUNT, *seen, *own]))
