@@ -56,8 +56,9 @@ def test_a_folder_tells_its_track_and_refuses_another(tmp_path):
     config = json.loads((tmp_path / "results.json").read_text())["config"]
     assert config["track"] == TRACK.told()
     evaluate(SENSED, sensor=NOISY, track=TRACK, out=tmp_path, **QUIET)
-    for other in (None, dataclasses.replace(TRACK, gate=3.0)):
-        with pytest.raises(InputError, match="another configuration: track is"):
+    # Without a track the planner is another one; nothing is said then of what there is not.
+    for other, named in ((None, "weights of pursuit"), (dataclasses.replace(TRACK, gate=3.0), "track")):
+        with pytest.raises(InputError, match=f"another configuration: {named} is"):
             evaluate(SENSED, sensor=NOISY, track=other, out=tmp_path, **QUIET)
 
 

@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 import torch
+from torch.utils._python_dispatch import TorchDispatchMode
 
 from torchdyn_plan.errors import InputError
 from torchdyn_plan.planners import KalmanTrack, LeastSquaresTrack
@@ -239,6 +240,34 @@ def test_a_batch_is_its_rows(track, dtype):
             row = measured(track, times, places[i, j])
             for name, one, other in zip(whole._fields, whole, row, strict=True):
                 torch.testing.assert_close(one[i, j], other, rtol=1e-5, atol=1e-7, msg=name)
+
+
+class Operations(TorchDispatchMode):
+    """Counts what PyTorch is asked to do: on few rows that is what a track costs."""
+
+    def __init__(self):
+        super().__init__()
+        self.count = 0
+
+    def __torch_dispatch__(self, function, types, args=(), kwargs=None):
+        self.count += 1
+        return function(*args, **kwargs or {})
+
+
+@pytest.mark.parametrize(
+    ("track", "most"), list(zip(KINDS, (34, 58, 35), strict=True)), ids=["velocity", "acceleration", "least squares"]
+)
+def test_a_measurement_takes_few_operations_and_none_takes_nearly_none(track, most):
+    times, places, _, _ = line(1, noise=0.001)
+    state, now = measured(track, times[:-1], places[:, :-1]), times[-1:]
+    with Operations() as taken:
+        after = track.add(state, now, places[:, -1], now)
+    assert (after.used == 20).all()
+    assert taken.count <= most
+    never = torch.full_like(now, torch.nan)
+    with Operations() as nothing:
+        assert track.add(state, never, places[:, -1], now) is state
+    assert nothing.count <= 2
 
 
 @ALL

@@ -187,3 +187,11 @@ def test_measurements_of_a_wrong_shape_are_named():
     td[keys.MEASURED_TIME], td[keys.MEASURED_POS] = torch.zeros(2, 1), torch.zeros(2, 1, 2)
     with pytest.raises(InputError, match=r"measured_pos must have shape \(\*B, 2, 1, 3\), got \(2, 1, 2\)"):
         tracked()(td)
+
+
+def test_the_history_is_as_long_as_the_forecaster_reads():
+    planner = make_planner()
+    planner.forecaster.history = 7
+    assert TrackedPlanner(planner, TRACK, control_step=STEP).history == 7
+    assert TrackedPlanner(make_planner(), TRACK, control_step=STEP).history == 24
+    assert tracked(planner).history == HISTORY
