@@ -25,6 +25,7 @@ ROW = {
     "planner",
     "static",
     "task",
+    "track",
     "settings",
     "episodes",
     "success",
