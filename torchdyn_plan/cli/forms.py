@@ -36,8 +36,6 @@ FITTED = {
 TRACKS = ("none", "least_squares", "kalman")
 """Tracks by name; tests hold them against `torchdyn_plan.evaluation.tracks`, which takes long to import."""
 TRACK_TEXT = "Filter between sensor and planner; with none planners see the newest measurement, held."
-
-
 RECORDED = (
     "File of recorded tracks to take for paths, .csv, .parquet, .npy or .npz: time [s], x, y and z [m], track. "
     "Nothing is simulated then."
