@@ -54,8 +54,9 @@ PARTS = {"arms", "former_latency_side", "sides", "study"}
 """No scripts of their own."""
 
 
-# Each side of a comparison by time is a process that starts from nothing; `kinematics_beside` has such sides, too.
-LONG = {"former_latency"}
+LONG = {"ablation", "braking", "following", "forecast_gain", "former_latency", "inverse"}
+"""Ten seconds each: `make check` runs them. Others that `make test` runs use the same harness: `recovery` and
+`schedules` play episodes with changed planners, `kinematics_beside` has sides in processes of their own."""
 
 
 @pytest.mark.parametrize("name", [pytest.param(name, marks=[pytest.mark.slow] * (name in LONG)) for name in SMALL])

@@ -59,7 +59,7 @@ def test_without_a_compiler_the_error_says_so(tmp_path):
         "try: Fused(lambda x: ([x[0] + 1.0],))(torch.zeros(1, 1))\n"
         "except CompileError as error: print(error)"
     )
-    settings = {"CXX": "no-such-compiler", "TORCHINDUCTOR_CACHE_DIR": str(tmp_path), "TORCHINDUCTOR_COMPILE_THREADS": "1"}
-    environment = {**os.environ, **settings}
+    environment = {**os.environ, "CXX": "no-such-compiler", "TORCHINDUCTOR_CACHE_DIR": str(tmp_path)}
+    environment |= {"TORCHINDUCTOR_COMPILE_THREADS": "1"}
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False, env=environment)
     assert "cannot be compiled; it needs a working C++ compiler" in done.stdout, done.stderr
