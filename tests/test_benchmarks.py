@@ -54,9 +54,19 @@ PARTS = {"arms", "former_latency_side", "sides", "study"}
 """No scripts of their own."""
 
 
-LONG = {"ablation", "braking", "following", "forecast_gain", "former_latency", "inverse"}
-"""Ten seconds each: `make check` runs them. Others that `make test` runs use the same harness: `recovery` and
-`schedules` play episodes with changed planners, `kinematics_beside` has sides in processes of their own."""
+LONG = {
+    "ablation",
+    "braking",
+    "calibration",
+    "following",
+    "forecast_gain",
+    "former_latency",
+    "inverse",
+    "kinematics_beside",
+    "latency",
+    "worst_case",
+}
+"""Five to twenty seconds each: `make check` runs them. Those that `make test` runs use the same harness and planners."""
 
 
 @pytest.mark.parametrize("name", [pytest.param(name, marks=[pytest.mark.slow] * (name in LONG)) for name in SMALL])
