@@ -66,7 +66,7 @@ LONG = {
     "latency",
     "worst_case",
 }
-"""Five to twenty seconds each: `make check` runs them. Those that `make test` runs use the same harness and planners."""
+"""Five to twenty seconds each: `make check` runs them; those that `make test` runs use the same harness."""
 
 
 @pytest.mark.parametrize("name", [pytest.param(name, marks=[pytest.mark.slow] * (name in LONG)) for name in SMALL])

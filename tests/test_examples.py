@@ -29,8 +29,7 @@ EXAMPLES = Path(__file__).parent.parent / "examples"
         ("07_fine_tune_forecaster.py", "after: miss 0.0"),
         ("08_meet_a_walker.py meeting.webp", "written: meeting.webp"),
         ("fine_tune_in_rollout.py --balls 4 --rounds 2 --steps 150", "round 2: "),
-        # Each of its processes starts from nothing, as those in tests/planners/test_memory.py do.
-        pytest.param("collect_in_parallel.py --balls 2 --steps 120", "of 4 balls, ", marks=pytest.mark.slow),
+        ("collect_in_parallel.py --balls 2 --steps 120", "of 4 balls, "),
         ("stock_torchrl.py --frames 400 --warmup 200 --batch 32", "400 frames: return"),
         ("sb3_her.py --steps 250", "after 250 steps"),
     ],
