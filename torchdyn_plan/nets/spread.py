@@ -29,6 +29,8 @@ class SpreadConfig:
     """Rank of the head."""
     finest: float = 1e-5
     """Errors are not told apart below this [m]; it is added to every error before its logarithm is taken."""
+    tracked: bool = False
+    """Whether the forecaster that it judges is."""
 
     def __post_init__(self) -> None:
         for name in ("features", "horizon", "hidden", "rank"):
@@ -96,6 +98,7 @@ class SpreadForecaster(ForecastModel):
         """Judge the paths of ``forecaster`` by ``spread``, which was fitted to its errors."""
         super().__init__()
         self.forecaster, self.spread, self.history = forecaster, spread, forecaster.history
+        self.in_keys = forecaster.in_keys
 
     def predict(self, *seen: Tensor) -> Forecast:
         """Path and spread."""

@@ -24,6 +24,8 @@ if TYPE_CHECKING:
 
     from torchdyn_plan.envs.moving_target import MovingTargetEnv
 
+NOISY = "noisy_"
+"""Begin of the names of networks for targets that are measured with noise, and seen by a track."""
 NEAREST_ETA = "nearest_eta"
 """Network of the times until the robot is as near to a goal as it can come, and the end of its weights' name."""
 ENTRY_POINTS = "torchdyn_plan.tasks"

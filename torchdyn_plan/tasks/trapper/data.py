@@ -121,6 +121,9 @@ def trapper_fitting(scene: TrapperScene | str | None = None) -> Fitting:
 
     return Fitting(
         forecaster=ForecasterConfig(square_symmetry=True, half_extent=scene.half_side - scene.ball_radius),
+        noisy_forecaster=ForecasterConfig(
+            history=48, stride=2, tracked=True, square_symmetry=True, half_extent=scene.half_side - scene.ball_radius
+        ),
         eta=ETAConfig(),
         spread=True,
         near=waiting_search(scene).footprint,
