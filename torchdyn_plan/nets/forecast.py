@@ -39,10 +39,21 @@ class ForecastModel(nn.Module, ABC):
     in_keys: Sequence[Any] = (keys.TARGET_HISTORY,)
     history: int | None = None
     """Positions H that it reads of the target's history; None for any number."""
+    samples: int | None = None
+    """Samples of a target, as a track shows it, from which on its forecasts are of use; None where nobody says."""
 
     @abstractmethod
     def predict(self, *seen: Tensor) -> Forecast:
         """Forecast from the entries ``in_keys``, ``(*B, …)`` each."""
+
+    @property
+    def chosen(self) -> ForecastModel:
+        """The model that makes the forecasts; by default the model itself."""
+        return self
+
+    def for_noise(self, noise: float) -> ForecastModel:
+        """The model for targets that a track sees by measurements of standard deviation ``noise`` [m]; itself."""
+        return self
 
     def for_inference(self) -> ForecastModel:
         """The same function in as few operations as possible; by default the model itself."""

@@ -94,6 +94,7 @@ class Forecaster(Pretrained, Precise, DescribedForecast):
         super().__init__()
         self.config = config = config or ForecasterConfig(**settings)
         self.history, self.in_keys = config.history, keys_of(config)
+        self.samples = LEAST_SAMPLES if config.tracked else None
         channels, length = config.channels, config.history // config.stride - 1
         self.embed = nn.Conv1d(7, channels, 1)
         self.convolve = nn.ModuleList(nn.Conv1d(channels, channels, 3, stride=2) for _ in range(config.convolutions))
@@ -227,7 +228,7 @@ class Forecaster(Pretrained, Precise, DescribedForecast):
         return torch.cat([step, change, real.to(step.dtype)], dim=-1) * self.step_feature_scale
 
     def _present_features(self, now: Tensor, step: Tensor, known: Tensor | None) -> Tensor:
-        """Newest position and step, ``(R, 3)`` each, when and where they lead to a cushion, what is ``known``: (R, P)."""
+        """Newest position and step, ``(R, 3)`` each, when and where they lead to a cushion, and what is ``known``."""
         features, extent, horizon = [now, step], self.config.half_extent, self.config.horizon
         if extent is not None:
             place, speed = now[:, :2], step[:, :2]
@@ -264,6 +265,8 @@ def how_well_known(covariance: Tensor) -> Tensor:
     return torch.cat([deviations, (both * (place * speed).rsqrt()).unsqueeze(-1)], dim=-1)
 
 
+LEAST_SAMPLES = 2
+"""A target that a track has seen so often has a velocity."""
 LEAST_VARIANCE = 1e-10
 """Added to variances before their logarithm is taken [m², m²/s²]."""
 

@@ -113,7 +113,8 @@ class InferenceForecaster(Precise, DescribedForecast):
         """Take the weights of ``network``, and of the ``spread`` that judges it, as they are now."""
         super().__init__()
         self.config = config = network.config
-        self.history, self.in_keys, self.judged = config.history, network.in_keys, spread is not None
+        self.history, self.in_keys, self.samples = config.history, network.in_keys, network.samples
+        self.judged = spread is not None
         dtype, exact = network.head.weight.dtype, copy.deepcopy(network).double()
         hold_constants(self, dtype, turns=_turns(exact), octants=_octants(exact))
         embed: Any = exact.embed

@@ -98,7 +98,7 @@ class SpreadForecaster(ForecastModel):
         """Judge the paths of ``forecaster`` by ``spread``, which was fitted to its errors."""
         super().__init__()
         self.forecaster, self.spread, self.history = forecaster, spread, forecaster.history
-        self.in_keys = forecaster.in_keys
+        self.in_keys, self.samples = forecaster.in_keys, forecaster.samples
 
     def predict(self, *seen: Tensor) -> Forecast:
         """Path and spread."""

@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
+import dataclasses
 from collections.abc import Callable
 from dataclasses import dataclass
 from fractions import Fraction
-from typing import TYPE_CHECKING, ClassVar, NamedTuple, Protocol
+from typing import TYPE_CHECKING, Any, ClassVar, NamedTuple, Protocol
 
 import torch
 from torch import Tensor
@@ -210,6 +211,15 @@ class EventSchedule:
             misfit = (miss > self.miss) | (late(looked) > self.late) | (plan.arrival_steps == 0)
             due = due | (looked & misfit)
         return Clock(window, torch.where(due, window, countdown), replans + due), due
+
+
+def starting_at(schedule: Schedule, first_step: int) -> Schedule:
+    """``schedule`` with its first plan at ``first_step``; as it is where it does not tell when it plans first."""
+    settings: Any = schedule
+    named = dataclasses.is_dataclass(schedule) and any(
+        field.name == "first_step" for field in dataclasses.fields(schedule)
+    )
+    return dataclasses.replace(settings, first_step=first_step) if named else schedule
 
 
 def lateness(eta: ArrivalModel, observation: Observation, plan: Plan, chunk: int | None, rows: Tensor) -> Tensor:

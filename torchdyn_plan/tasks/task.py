@@ -301,6 +301,23 @@ class PlannerParts:
         return SpreadForecaster(self.forecaster, self._load(SpreadNetwork, self._path_weights)).eval()
 
     @property
+    def forecaster_by_noise(self) -> Any:
+        """`spread_forecaster`, and beside it the one for targets that are measured with noise, where there is one."""
+        from torchdyn_plan.nets import ForecastByNoise, Forecaster, SpreadForecaster, SpreadNetwork
+
+        if self.weights is None:
+            names = [f"{self._path_weights}-noisy"] * 2
+        else:
+            names = [self.weights / f"{NOISY}{kind}" for kind in ("forecaster", "spread")]
+            if not all(folder.is_dir() for folder in names):
+                return self.spread_forecaster
+        forecaster, spread = (
+            kind.from_pretrained(name).requires_grad_(False)
+            for kind, name in zip((Forecaster, SpreadNetwork), names, strict=True)
+        )
+        return ForecastByNoise(self.spread_forecaster, SpreadForecaster(forecaster, spread)).eval()
+
+    @property
     def eta(self) -> Any:
         """The `ETANetwork` of the static planner, frozen."""
         from torchdyn_plan.nets import ETANetwork

@@ -62,9 +62,9 @@ def fit_forecaster(
 ) -> Path:
     """Fit a `Forecaster` to the ``paths`` in ``data``; one in ten episodes is held out and scored.
 
-    One that is ``tracked`` sees the paths through sensors and a track, as the task's `Fitting.sighting` says. ``config``
-    is the task's by default; ``name`` is that of its folder in ``out``; without ``resume`` a checkpoint in ``out`` is
-    not continued.
+    One that is ``tracked`` sees the paths through sensors and a track, as the task's `Fitting.sighting` says.
+    ``config`` is the task's by default; ``name`` is that of its folder in ``out``; without ``resume`` a checkpoint in
+    ``out`` is not continued.
     """
     fitting = task_fitting(task)
     config, recipe = config or fitting.forecaster, recipe or fitting.recipe("forecaster")
@@ -80,9 +80,9 @@ def fit_forecaster(
 
     def score() -> Tables:
         errors, lost = [], []
-        for name, windows in regimes.items():
+        for sensor, windows in regimes.items():
             forecast = _forecasts(network, windows, recipe.device)
-            columns = {"sensor": name} if name else {}
+            columns = {"sensor": sensor} if sensor else {}
             rows = forecast_errors(forecast, windows, ahead=fitting.ahead, fast=fitting.fast)
             errors += [columns | row for row in rows]
             if fitting.lost is not None:
@@ -96,9 +96,7 @@ def fit_forecaster(
     optimise(network, loss, lambda: _forecast_figures(score()), recipe, out=folder, settings=settings, resume=resume)
     counts = {"episodes": episodes, "held out": len(samples.held)}
     facts = about | counts
-    return write_network(
-        network, folder, score, task=words_of(task), recipe=recipe, facts=facts, network_name=name
-    )
+    return write_network(network, folder, score, task=words_of(task), recipe=recipe, facts=facts, network_name=name)
 
 
 def path_samples(task: Task, data: Path, config: ForecasterConfig, seed: int) -> PathSamples | SightedSamples:

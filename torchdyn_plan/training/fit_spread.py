@@ -76,9 +76,7 @@ def fit_spread(
     optimise(network, loss, validate, recipe, out=folder, settings=settings, resume=resume)
     counts = {"episodes": episodes, "held out": len(samples.held), "forecaster": forecaster}
     facts = about | counts
-    return write_network(
-        network, folder, score, task=words_of(task), recipe=recipe, facts=facts, network_name=name
-    )
+    return write_network(network, folder, score, task=words_of(task), recipe=recipe, facts=facts, network_name=name)
 
 
 def spread_loss(forecaster: Forecaster, network: SpreadNetwork, windows: Windows) -> Tensor:

@@ -139,7 +139,9 @@ class SightedSamples:
         if lines is None:
             future = paths.positions[index]
         else:
-            side, shift = stretch_of(lines, now, torch.minimum(seen.present, seen.present.new_tensor(LOOK_BACK)), history)
+            side, shift = stretch_of(
+                lines, now, torch.minimum(seen.present, seen.present.new_tensor(LOOK_BACK)), history
+            )
             future = lines.track[index]
             future[..., :2] = (future[..., :2] - shift.unsqueeze(-2)) * side.unsqueeze(-2)
         moves = paths.positions[now] - paths.positions[torch.maximum(now - 1, first)]

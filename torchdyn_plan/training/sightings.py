@@ -154,7 +154,9 @@ def measure(
     seen = torch.ceil((taken + sensors.latency.unsqueeze(-1)) / control_step - 1e-9).long()
     seen[:, 0] = 0
     pos = _places(paths, episodes, taken / control_step) + error
-    found = Measured(torch.full((len(episodes), steps + 1), torch.nan), torch.full((*shape[:1], steps + 1, 3), torch.nan))
+    found = Measured(
+        torch.full((len(episodes), steps + 1), torch.nan), torch.full((*shape[:1], steps + 1, 3), torch.nan)
+    )
     newest = torch.full((len(episodes), steps + 1), NEVER)
     there = ~lost & (seen <= steps)
     newest.scatter_reduce_(
@@ -167,7 +169,7 @@ def measure(
 
 
 def _places(paths: Paths, episodes: Tensor, when: Tensor) -> Tensor:
-    """Positions ``(M, K, 3)`` [m, world] of the paths of ``episodes`` (M,) at moments ``when`` (M, K) [control steps]."""
+    """Positions ``(M, K, 3)`` [m, world] of ``episodes`` (M,) at moments ``when`` (M, K) [control steps]."""
     before = when.floor().long()
     first, last = paths.start[episodes].unsqueeze(-1), (paths.length[episodes] - 1).unsqueeze(-1)
     old, new = (paths.positions[first + torch.minimum(before + more, last)] for more in (0, 1))
@@ -235,9 +237,7 @@ def record_sightings(
             else sensors.draw(len(block), generator)
         )
         measured = measure(paths, block, drawn, steps, control_step=control_step, generator=generator)
-        state, covariance, usable = follow(
-            track, measured, drawn, control_step=control_step, least_noise=least_noise
-        )
+        state, covariance, usable = follow(track, measured, drawn, control_step=control_step, least_noise=least_noise)
         last = last_step[block].clamp(min=0, max=steps).unsqueeze(-1)
         chance = torch.rand((len(block), each), generator=generator)
         # Squared: presents lie denser where targets are still fast.
