@@ -17,6 +17,7 @@ from torchdyn_plan.errors import InputError
 from torchdyn_plan.planners.observation import Observation
 from torchdyn_plan.planners.plan import Plan
 from torchdyn_plan.planners.rows import any_row, apply_to_rows
+from torchdyn_plan.planners.seconds import steps_in
 
 if TYPE_CHECKING:
     from torchdyn_plan.nets.arrival import ArrivalModel
@@ -121,6 +122,15 @@ class ReplanSchedule:
         """A plan at ``first_step`` and every ``steps`` from then on; at step 1 a target has been seen to move."""
         check_number("steps", steps, minimum=1, integer=True)
         return cls(first_step=first_step, window=steps, shrink=1.0, minimum=steps)
+
+    @classmethod
+    def every_seconds(cls, seconds: float, *, control_step: float, first: float | None = None) -> ReplanSchedule:
+        """A plan every ``seconds``, and the first one ``first`` [s] after the reset; after a step for None.
+
+        Times are whole control steps of ``control_step`` [s], rounded up.
+        """
+        first_step = 1 if first is None else steps_in("first", first, control_step)
+        return cls.every(max(steps_in("seconds", seconds, control_step), 1), first_step=first_step)
 
     @property
     def longest(self) -> int:
