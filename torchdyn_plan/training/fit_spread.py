@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import asdict
 from pathlib import Path
@@ -82,7 +83,10 @@ def fit_spread(
 def spread_loss(forecaster: Forecaster, network: SpreadNetwork, windows: Windows) -> Tensor:
     """Negative log-likelihood of the errors' sizes (logistic in their logarithm), and of being lost or not.
 
-    Both are proper scores, averaged over the steps ahead. Errors count until the target is lost.
+    Errors of a forecaster that sees by a track are those of the measurements, with lighter tails than the spread has:
+    there the quantiles `QUANTILES` of their logarithm count (pinball loss) in place of the likelihood, so that
+    intervals cover what they say. All are proper scores, averaged over the steps ahead. Errors count until the target
+    is lost.
     """
     device = network.head.weight.device
     with torch.no_grad():
@@ -90,10 +94,23 @@ def spread_loss(forecaster: Forecaster, network: SpreadNetwork, windows: Windows
         error = (forecast - windows.future.to(device))[..., :2].abs() + network.config.finest
     recorded = windows.recorded.to(device)
     log_scale, log_shape, gone = network.raw(features, swapped)
-    beyond = log_shape.exp() * (error.log() - log_scale)
-    likelihood = log_shape - beyond - 2.0 * softplus(-beyond)
-    size = -(likelihood.mean(-1) * recorded).sum() / recorded.sum().clamp_min(1)
+    beyond = error.log() - log_scale
+    if forecaster.config.tracked:
+        score = sum(_pinball(beyond - math.log(share / (1.0 - share)) / log_shape.exp(), share) for share in QUANTILES)
+    else:
+        beyond = log_shape.exp() * beyond
+        score = 2.0 * softplus(-beyond) + beyond - log_shape
+    size = (score.mean(-1) * recorded).sum() / recorded.sum().clamp_min(1)
     return size + binary_cross_entropy_with_logits(gone, (~recorded).to(gone.dtype))
+
+
+QUANTILES = (0.5, 0.8, 0.95)
+"""Shares of errors that lie within the intervals by which the spread of a tracked forecaster is fitted."""
+
+
+def _pinball(beyond: Tensor, share: float) -> Tensor:
+    """Loss whose mean is least where a ``share`` of the values ``beyond`` (*B,) is negative."""
+    return torch.maximum(share * beyond, (share - 1.0) * beyond)
 
 
 def _tables(
