@@ -78,7 +78,7 @@ class PathSamples:
         for kind in (full, padded):
             episodes = _some(self.held[self.last[self.held] >= kind.first_step], SCORED)
             scored.append(draw_windows(self.paths, self.last, episodes, kind, draws))
-        return Windows(*(torch.cat(tensors) for tensors in zip(*scored, strict=True)))
+        return Windows.joined(scored)
 
 
 def _some(rows: Tensor, count: int) -> Tensor:

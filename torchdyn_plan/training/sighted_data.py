@@ -115,8 +115,7 @@ class SightedSamples:
 
     def held_windows(self, seed: int) -> Windows:
         """Windows of held-out episodes from all regimes."""
-        parts = zip(*self.regimes(seed).values(), strict=True)
-        return Windows(*(torch.cat(tensors) for tensors in parts))
+        return Windows.joined(list(self.regimes(seed).values()))
 
     def regimes(self, seed: int) -> dict[str, Windows]:
         """Windows of held-out episodes, about `SCORED` of each regime, by its name."""

@@ -1,5 +1,8 @@
 """Windows of a target's recorded path: the history that a forecaster sees and the future that it should emit."""
 
+from __future__ import annotations
+
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import NamedTuple
@@ -44,6 +47,12 @@ class Windows(NamedTuple):
     """(*B,) bool: the target moves at the window's present."""
     covariance: Tensor | None = None
     """(*B, 2, 2) of position and velocity at the present, where a track saw the target [m², m²/s; m²/s, m²/s²]."""
+
+    @classmethod
+    def joined(cls, parts: Sequence[Windows]) -> Windows:
+        """All of them, one after the other; either all or none were seen by a track."""
+        fields = zip(*parts, strict=True)
+        return cls(*(None if values[0] is None else torch.cat(values) for values in fields))
 
     @property
     def seen(self) -> tuple[Tensor, ...]:

@@ -151,4 +151,4 @@ def rolled_windows(scene: TrapperScene, drawing: WindowConfig, *, friction: floa
         episodes = (paths.length > present + 1).nonzero().squeeze(-1)
         now = torch.full_like(episodes, present)
         parts.append(cut_windows(paths, episodes, now, now.clamp(max=drawing.history), drawing))
-    return Windows(*(torch.cat(tensors) for tensors in zip(*parts, strict=True)))
+    return Windows.joined(parts)
