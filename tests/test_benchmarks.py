@@ -45,6 +45,7 @@ ELSEWHERE = {
     "nearest",
     "paper_scene",
     "policy_curves",
+    "sensor_curves",
     "policy_peers",
     "same_episodes",
 }

@@ -232,7 +232,7 @@ BAD = [
     (["collect", "paths", "--out", "{file}"], "output folder '{file}' is not writable"),
     (["collect", "arrivals", "--static", "kuka", "--out", "{out}"], "unknown static planner of trapper 'kuka'"),
     (["collect", "arrivals", "--weights", "{new}", "--out", "{out}"], "no weights '{new}'"),
-    (["train", "dher"], "unknown network of trapper 'dher'; choose from eta, forecaster, nearest_eta, policy, spread"),
+    (["train", "dher"], "unknown network of trapper 'dher'; choose from eta, forecaster, nearest_eta, noisy_"),
     (["train", "eta", "--static", "kuka", "--out", "{new}"], "unknown static planner of trapper 'kuka'"),
     (["train", "eta"], "no arrivals-*.json in 'runs/data/trapper-ik'"),
     (["train", "eta", "--static", "rl"], "no arrivals-*.json in 'runs/data/trapper-rl'"),

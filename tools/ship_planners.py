@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Any
 
 from torchdyn_plan.files import write_json
-from torchdyn_plan.nets import ETANetwork
+from torchdyn_plan.nets import ETANetwork, Forecaster, SpreadNetwork
 from torchdyn_plan.nets.policy import Actor
 from torchdyn_plan.nets.pretrained import SHIPPED, Pretrained
 from torchdyn_plan.planners.pretrained import describe_planner
@@ -44,7 +44,8 @@ def weights_file(task: Task, own: str, network: Pretrained) -> str:
     if isinstance(network, ETANetwork):
         return f"{network.kind}-{own}{'' if network.config.never else '-nearest'}.safetensors"
     shared = task.weights_name if isinstance(network, Actor) else task.path_weights or task.weights_name
-    return f"{network.kind}-{shared}.safetensors"
+    noisy = isinstance(network, (Forecaster, SpreadNetwork)) and network.config.tracked
+    return f"{network.kind}-{shared}{'-noisy' if noisy else ''}.safetensors"
 
 
 def main(folder: Path = SHIPPED) -> None:

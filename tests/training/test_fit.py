@@ -122,14 +122,14 @@ def test_loss_forgives_the_place_of_a_lost_target_but_not_its_height():
         future = network.unreflected(history)
     recorded = torch.arange(300).unsqueeze(0) < 100
     windows = Windows(history, torch.tensor([24]), future, recorded, torch.tensor([True]), torch.tensor([True]))
-    assert line_loss(network, windows) < 1e-4
+    assert line_loss(network, windows, control_step=0.004) < 1e-4
     moved = future.clone()
     moved[:, 100:, :2] += 1.0
-    assert line_loss(network, windows._replace(future=moved)) < 1e-4
+    assert line_loss(network, windows._replace(future=moved), control_step=0.004) < 1e-4
     moved[:, 99, 0] += 1.0
-    assert line_loss(network, windows._replace(future=moved)) > 1e-3
+    assert line_loss(network, windows._replace(future=moved), control_step=0.004) > 1e-3
     sunk = future - torch.tensor([0.0, 0.0, 0.1])
-    assert line_loss(network, windows._replace(future=sunk)).item() == pytest.approx(1.0, abs=1e-3)
+    assert line_loss(network, windows._replace(future=sunk), control_step=0.004).item() == pytest.approx(1.0, abs=1e-3)
 
 
 def test_a_task_without_networks_is_named(data, tmp_path):

@@ -1,5 +1,6 @@
 """Any network of any task, by its own recipe but for what is asked for."""
 
+import json
 from dataclasses import replace
 
 import pytest
@@ -7,10 +8,11 @@ import torch
 from safetensors.torch import load_file
 
 from tests.training.toy_task import TASK, LearnOptions
+from torchdyn_plan.envs.sensor import Sensor
 from torchdyn_plan.errors import InputError, TrainingError
-from torchdyn_plan.nets import Actor, ETANetwork, Forecaster
+from torchdyn_plan.nets import Actor, ETANetwork, Forecaster, SpreadNetwork
 from torchdyn_plan.tasks import load_task
-from torchdyn_plan.training import Recipe
+from torchdyn_plan.training import Recipe, SensorRange, Sighting
 from torchdyn_plan.training.collect import collect
 from torchdyn_plan.training.goal_task import DDPGRecipe
 from torchdyn_plan.training.train import networks, train
@@ -30,7 +32,8 @@ def few_rows(monkeypatch):
 
 
 def test_networks_are_those_that_the_task_has_data_and_recipes_for():
-    assert networks(TASK) == ("forecaster", "spread", "eta", "nearest_eta", "policy")
+    noisy = ("noisy_forecaster", "noisy_spread")
+    assert networks(TASK) == ("forecaster", "spread", *noisy, "eta", "nearest_eta", "policy")
     assert networks(replace(TASK, record_paths=None)) == networks(TASK)
     assert networks(replace(TASK, fitting=None)) == ("policy",)
     assert networks(load_task("fetch_reach"))[-2:] == ("policy", "dher")
@@ -66,7 +69,32 @@ def test_the_forecaster_that_ships_stands_in_for_a_missing_one(monkeypatch, tmp_
         "torchdyn_plan.training.fit_spread.fit_spread", lambda *_, forecaster, **__: found.append(forecaster)
     )
     train("trapper", "spread", tmp_path, tmp_path)
-    assert found == ["trapper"]
+    train("trapper", "noisy_spread", tmp_path, tmp_path)
+    assert found == ["trapper", "trapper-noisy"]
+
+
+def test_networks_for_measured_targets_are_trained_by_sensors_and_a_track(data, tmp_path, monkeypatch):
+    monkeypatch.setattr("torchdyn_plan.training.sighted_data.SCORED", 8)
+    config = replace(TASK.fitting().forecaster, tracked=True)
+    regimes = {"exact": Sensor(), "slow": Sensor(noise=0.001, rate=5.0)}
+    sighting = Sighting(passes=1, each=4, steps=25, sensors=SensorRange(slowest=5.0, fastest=10.0), regimes=regimes)
+    fitting = replace(TASK.fitting(), noisy_forecaster=config, sighting=sighting)
+    task = replace(TASK, fitting=lambda: fitting)
+    with pytest.raises(InputError, match="toy has no forecaster for targets that are measured with noise"):
+        train(TASK, "noisy_forecaster", data, tmp_path)
+    file = train(task, "noisy_forecaster", data, tmp_path, steps=4, batch=8)
+    assert file == tmp_path / "noisy_forecaster" / "forecaster.safetensors"
+    assert Forecaster.from_pretrained(file).config == config
+    assert "train noisy_forecaster --task toy --steps 4" in file.with_suffix(".md").read_text()
+    rows = json.loads((file.parent / "scores.json").read_text())["Errors on held-out windows [m]"]
+    assert {row["sensor"] for row in rows} == set(regimes)
+    again = train(task, "noisy_forecaster", data, tmp_path / "again", steps=4, batch=8)
+    one, other = load_file(file), load_file(again)
+    assert all(torch.equal(one[name], other[name]) for name in one)
+    spread = train(task, "noisy_spread", data, tmp_path, steps=4, batch=8)
+    assert SpreadNetwork.from_pretrained(spread).config.tracked
+    rows = json.loads((spread.parent / "scores.json").read_text())["Coverage on held-out windows"]
+    assert {row["sensor"] for row in rows} == set(regimes)
 
 
 def test_a_policy_learns_by_the_recipe_of_its_task(tmp_path):

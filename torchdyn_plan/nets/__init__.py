@@ -3,6 +3,7 @@
 from torchdyn_plan.nets.analytic import Ballistic, Billiard, ConstantVelocity
 from torchdyn_plan.nets.analytic_arrival import AnalyticArrival, GoalJoints, SolvedJoints
 from torchdyn_plan.nets.arrival import ArrivalModel, ArrivalQuery, FunctionArrival
+from torchdyn_plan.nets.by_noise import ForecastByNoise
 from torchdyn_plan.nets.distributions import ESTIMATORS, Arrival, Spread
 from torchdyn_plan.nets.eta import ETAConfig, ETANetwork
 from torchdyn_plan.nets.forecast import DescribedForecast, Forecast, ForecastModel, FunctionForecast
@@ -26,6 +27,7 @@ __all__ = [
     "ETAConfig",
     "ETANetwork",
     "Forecast",
+    "ForecastByNoise",
     "ForecastModel",
     "Forecaster",
     "ForecasterConfig",

@@ -39,10 +39,21 @@ class ForecastModel(nn.Module, ABC):
     in_keys: Sequence[Any] = (keys.TARGET_HISTORY,)
     history: int | None = None
     """Positions H that it reads of the target's history; None for any number."""
+    samples: int | None = None
+    """Samples of a target, as a track shows it, from which on its forecasts are of use; None where nobody says."""
 
     @abstractmethod
     def predict(self, *seen: Tensor) -> Forecast:
         """Forecast from the entries ``in_keys``, ``(*B, …)`` each."""
+
+    @property
+    def chosen(self) -> ForecastModel:
+        """The model that makes the forecasts; by default the model itself."""
+        return self
+
+    def for_noise(self, noise: float) -> ForecastModel:
+        """The model for targets that a track sees by measurements of standard deviation ``noise`` [m]; itself."""
+        return self
 
     def for_inference(self) -> ForecastModel:
         """The same function in as few operations as possible; by default the model itself."""
@@ -76,11 +87,16 @@ class DescribedForecast(ForecastModel):
     """A forecast model that also tells what it saw, from which its errors can be judged."""
 
     @abstractmethod
-    def forward(self, target_history: Tensor) -> Tensor:
-        """Positions at the next F control steps, ``(*B, F, D)`` [m, world], after histories ``(*B, H, D)``."""
+    def forward(self, target_history: Tensor, target_covariance: Tensor | None = None) -> Tensor:
+        """Positions at the next F control steps, ``(*B, F, D)`` [m, world], after histories ``(*B, H, D)``.
+
+        ``target_covariance`` (*B, 2, 2) is read by models whose ``in_keys`` have it [m², m²/s; m²/s, m²/s²].
+        """
 
     @abstractmethod
-    def describe(self, target_history: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    def describe(
+        self, target_history: Tensor, target_covariance: Tensor | None = None
+    ) -> tuple[Tensor, Tensor, Tensor]:
         """The same positions, the features (*B, hidden) behind them, and whether x and y are swapped in these (*B,)."""
 
     def predict(self, *seen: Tensor) -> Forecast:
@@ -89,8 +105,11 @@ class DescribedForecast(ForecastModel):
 
 
 def in_plane(
-    forecast: Callable[[Tensor], tuple[Tensor, Tensor, Tensor]], target_history: Tensor
+    forecast: Callable[..., tuple[Tensor, Tensor, Tensor]], target_history: Tensor, *beside: Any
 ) -> tuple[Tensor, Tensor, Tensor]:
-    """What ``forecast`` makes of histories (*B, H, 2) at height 0; of its path, the first entry, x and y alone."""
-    path, *others = forecast(nn.functional.pad(target_history, (0, 1)))
+    """What ``forecast`` makes of histories (*B, H, 2) at height 0 and what is ``beside`` them.
+
+    Of its path, the first entry, x and y alone.
+    """
+    path, *others = forecast(nn.functional.pad(target_history, (0, 1)), *beside)
     return path[..., :2], others[0], others[1]

@@ -9,7 +9,8 @@ from typing import TYPE_CHECKING, Any
 import torch
 from torch import Tensor, nn
 
-from torchdyn_plan.checks import check_count, check_number, network_input
+from torchdyn_plan import keys
+from torchdyn_plan.checks import check_count, check_number, check_trailing_shape, network_input
 from torchdyn_plan.errors import InputError
 from torchdyn_plan.nets.forecast import DescribedForecast, in_plane
 from torchdyn_plan.nets.pretrained import Pretrained
@@ -49,9 +50,16 @@ class ForecasterConfig:
     """Where the target's centre turns back at a square table's cushions, |x| or |y| [m]; None where space is open."""
     square_symmetry: bool = False
     """Whether mirrored or turned histories (about z, by quarters) have exactly mirrored or turned forecasts."""
+    stride: int = 1
+    """Of the history every so many positions are read, the newest included."""
+    tracked: bool = False
+    """Whether it reads besides how well position and velocity are known, as a `torchdyn_plan.planners.Track` says."""
 
     def __post_init__(self) -> None:
         check_number("history", self.history, minimum=2, integer=True)
+        check_number("stride", self.stride, minimum=1, maximum=self.history // 2, integer=True)
+        if self.history % self.stride:
+            raise InputError(f"history must be a multiple of stride = {self.stride}, got {self.history}")
         for name in ("horizon", "channels", "convolutions", "hidden", "rank"):
             check_number(name, getattr(self, name), minimum=1, integer=True)
         check_count("convolutions", self.convolutions, maximum=16)
@@ -59,8 +67,9 @@ class ForecasterConfig:
             check_number(name, getattr(self, name), minimum=1e-9)
         if self.half_extent is not None:
             check_number("half_extent", self.half_extent, minimum=1e-9)
-        if not isinstance(self.square_symmetry, bool):
-            raise InputError(f"square_symmetry must be a bool, got {self.square_symmetry!r}")
+        for name in ("square_symmetry", "tracked"):
+            if not isinstance(getattr(self, name), bool):
+                raise InputError(f"{name} must be a bool, got {getattr(self, name)!r}")
 
 
 class Forecaster(Pretrained, Precise, DescribedForecast):
@@ -84,8 +93,9 @@ class Forecaster(Pretrained, Precise, DescribedForecast):
         """Build the network from ``config``, or from the fields of `ForecasterConfig` given as keywords."""
         super().__init__()
         self.config = config = config or ForecasterConfig(**settings)
-        self.history = config.history
-        channels, length = config.channels, config.history - 1
+        self.history, self.in_keys = config.history, keys_of(config)
+        self.samples = LEAST_SAMPLES if config.tracked else None
+        channels, length = config.channels, config.history // config.stride - 1
         self.embed = nn.Conv1d(7, channels, 1)
         self.convolve = nn.ModuleList(nn.Conv1d(channels, channels, 3, stride=2) for _ in range(config.convolutions))
         for _ in range(config.convolutions):
@@ -94,6 +104,8 @@ class Forecaster(Pretrained, Precise, DescribedForecast):
         present = [1.0 / config.length_scale] * 3 + step
         if config.half_extent is not None:
             present += [1.0 / config.horizon] * 2 + [0.25] * 2 + [1.0 / config.length_scale] * 2
+        if config.tracked:
+            present += [0.25, 0.25, 1.0]
         self.join = nn.Linear(channels * length + len(present), config.hidden)
         self.hidden = nn.Linear(config.hidden, config.hidden)
         self.mix = nn.Linear(config.hidden, config.rank)
@@ -113,22 +125,26 @@ class Forecaster(Pretrained, Precise, DescribedForecast):
         for name, value in constants.items():
             self.register_buffer(name, value, persistent=False)
 
-    def forward(self, target_history: Tensor) -> Tensor:
+    def forward(self, target_history: Tensor, target_covariance: Tensor | None = None) -> Tensor:
         """Positions at the next F control steps.
 
         Args:
             target_history: ``(*B, H, D)`` positions, oldest first; rows before the first sample repeat it [m, world].
                 Targets in a plane, D = 2, are those at height 0.
+            target_covariance: ``(*B, 2, 2)`` of position and velocity along each axis, for a network that is
+                ``tracked`` [m², m²/s; m²/s, m²/s²].
 
         Returns:
             ``(*B, F, D)``, of the history's type: entry e-1 is the position in e steps [m, world].
 
         Raises:
-            InputError: the history has another shape, another device than the network, or holds a NaN.
+            InputError: an argument is missing, or has another shape, another device than the network, or holds a NaN.
         """
-        return self._forecast(target_history, reflected=self.config.half_extent is not None)[0]
+        return self._forecast(target_history, target_covariance, reflected=self.config.half_extent is not None)[0]
 
-    def describe(self, target_history: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    def describe(
+        self, target_history: Tensor, target_covariance: Tensor | None = None
+    ) -> tuple[Tensor, Tensor, Tensor]:
         """The same forecast, and what a `torchdyn_plan.nets.SpreadNetwork` judges it by.
 
         Returns:
@@ -136,13 +152,14 @@ class Forecaster(Pretrained, Precise, DescribedForecast):
             float32 at least), and whether x and y are exchanged in it (*B,): mirrored and turned histories share their
             features.
         """
-        forecast, features, swapped = self._forecast(target_history, reflected=self.config.half_extent is not None)
+        reflected = self.config.half_extent is not None
+        forecast, features, swapped = self._forecast(target_history, target_covariance, reflected=reflected)
         batch = target_history.shape[:-2]
         return forecast, in_type_of(forecast, features).view(*batch, self.config.hidden), swapped.view(batch)
 
-    def unreflected(self, target_history: Tensor) -> Tensor:
+    def unreflected(self, target_history: Tensor, target_covariance: Tensor | None = None) -> Tensor:
         """Same as `forward` before cushions reflect the line: what training compares, ``(*B, F, 3)`` [m, world]."""
-        return self._forecast(target_history, reflected=False)[0]
+        return self._forecast(target_history, target_covariance, reflected=False)[0]
 
     def for_inference(self) -> InferenceForecaster:
         """A copy of the weights as they are now, in fewer operations; it does not follow later training."""
@@ -150,12 +167,14 @@ class Forecaster(Pretrained, Precise, DescribedForecast):
 
         return InferenceForecaster(self)
 
-    def _forecast(self, target_history: Tensor, *, reflected: bool) -> tuple[Tensor, Tensor, Tensor]:
+    def _forecast(
+        self, target_history: Tensor, target_covariance: Tensor | None, *, reflected: bool
+    ) -> tuple[Tensor, Tensor, Tensor]:
         """Positions (*B, F, 3), hidden features (R, hidden) and whether x and y are exchanged in them (R,)."""
         if autocast_is_on():
-            return without_autocast(self._forecast, target_history, reflected=reflected)
+            return without_autocast(self._forecast, target_history, target_covariance, reflected=reflected)
         if target_history.shape[-1] == 2:
-            return in_plane(partial(self._forecast, reflected=reflected), target_history)
+            return in_plane(partial(self._forecast, reflected=reflected), target_history, target_covariance)
         config, about = self.config, {"like": self.steps_ahead, "owner": type(self).__name__}
         seen = network_input("target_history", target_history, config.history, 3, **about)
         history, turn = seen.reshape(-1, config.history, 3), None
@@ -164,7 +183,11 @@ class Forecaster(Pretrained, Precise, DescribedForecast):
             # A pinch of position decides for a target that moves along an axis or lies still.
             turn = self.symmetries[octant(torch.add(now - before, now, alpha=1e-6))]
             history = torch.bmm(history, turn)
-        line, hidden = self._line(history)
+        known = None
+        if config.tracked:
+            covariance = check_covariance(target_covariance, target_history, **about)
+            known = how_well_known(covariance.view(-1, 2, 2))
+        line, hidden = self._line(history[:, config.stride - 1 :: config.stride], known)
         if reflected:
             assert config.half_extent is not None
             line = torch.cat([reflect(line[:, :2], config.half_extent), line[:, 2:]], dim=1)
@@ -174,14 +197,17 @@ class Forecaster(Pretrained, Precise, DescribedForecast):
         path = line.mT.view(*target_history.shape[:-2], config.horizon, 3)
         return path if path.dtype == target_history.dtype else path.to(target_history.dtype), hidden, swapped
 
-    def _line(self, history: Tensor) -> tuple[Tensor, Tensor]:
+    def _line(self, history: Tensor, known: Tensor | None) -> tuple[Tensor, Tensor]:
         """Unreflected positions (R, 3, F) after the turned histories (R, H, 3) [m], and the last hidden layer.
 
-        Features and what the layers make of them have the type of the layers' weights.
+        ``known`` (R, 3) is what `how_well_known` says. Features and what the layers make of them have the type of the
+        layers' weights.
         """
         now, step = history[:, -1], history[:, 1:] - history[:, :-1]
+        if self.config.stride > 1:
+            step = step / self.config.stride
         newest, stored = step[:, -1], self.join.weight.dtype
-        features, present = self._step_features(step), self._present_features(now, newest)
+        features, present = self._step_features(step), self._present_features(now, newest, known)
         if features.dtype != stored:
             features, present = features.to(stored), present.to(stored)
         for layer in (self.embed, *self.convolve):
@@ -201,15 +227,48 @@ class Forecaster(Pretrained, Precise, DescribedForecast):
         change = torch.asinh((step - step[:, -1:]) * (real / self.config.change_scale))
         return torch.cat([step, change, real.to(step.dtype)], dim=-1) * self.step_feature_scale
 
-    def _present_features(self, now: Tensor, step: Tensor) -> Tensor:
-        """Newest position and step, ``(R, 3)`` each, and when and where they lead to a cushion: ``(R, P)``."""
+    def _present_features(self, now: Tensor, step: Tensor, known: Tensor | None) -> Tensor:
+        """Newest position and step, ``(R, 3)`` each, when and where they lead to a cushion, and what is ``known``."""
         features, extent, horizon = [now, step], self.config.half_extent, self.config.horizon
         if extent is not None:
             place, speed = now[:, :2], step[:, :2]
             direction = torch.where(speed < 0, -1.0, 1.0)
             wait = (extent - place * direction).div_((speed * direction).clamp_min(1e-6)).clamp(0.0, 2.0 * horizon)
             features += [wait, wait.log1p(), reflect(torch.addcmul(place, speed, wait.flip(-1)), extent)]
+        if known is not None:
+            features.append(known)
         return torch.cat(features, dim=-1) * self.present_feature_scale
+
+
+def keys_of(config: ForecasterConfig) -> tuple[str, ...]:
+    """Entries of the observation that a forecaster of ``config`` reads."""
+    return (keys.TARGET_HISTORY, keys.TARGET_COVARIANCE) if config.tracked else (keys.TARGET_HISTORY,)
+
+
+def check_covariance(covariance: Tensor | None, history: Tensor, **about: Any) -> Tensor:
+    """The covariance (*B, 2, 2) beside histories (*B, H, D), as `network_input` takes it; raises `InputError`."""
+    if covariance is None:
+        raise InputError("a tracked forecaster reads target_covariance (*B, 2, 2) beside the history, got none")
+    if covariance.shape[:-2] != history.shape[:-2]:
+        check_trailing_shape(keys.TARGET_COVARIANCE, covariance, *history.shape[:-2], 2, 2)
+    return network_input(keys.TARGET_COVARIANCE, covariance, 2, 2, **about)
+
+
+def how_well_known(covariance: Tensor) -> Tensor:
+    """Features ``(R, 3)`` of covariances (R, 2, 2) of position and velocity.
+
+    They are the logarithms of both standard deviations, in units of 1 mm and 0.1 m/s, and the correlation.
+    """
+    place, both, speed = covariance[:, 0, 0], covariance[:, 0, 1], covariance[:, 1, 1]
+    place, speed = place + LEAST_VARIANCE, speed + LEAST_VARIANCE
+    deviations = torch.stack([place * 1e6, speed * 1e2], dim=-1).log() * 0.5
+    return torch.cat([deviations, (both * (place * speed).rsqrt()).unsqueeze(-1)], dim=-1)
+
+
+LEAST_SAMPLES = 2
+"""A target that a track has seen so often has a velocity."""
+LEAST_VARIANCE = 1e-10
+"""Added to variances before their logarithm is taken [m², m²/s²]."""
 
 
 def convolve(features: Tensor, layer: Any) -> Tensor:

@@ -113,13 +113,15 @@ class InferenceForecaster(Precise, DescribedForecast):
         """Take the weights of ``network``, and of the ``spread`` that judges it, as they are now."""
         super().__init__()
         self.config = config = network.config
-        self.history, self.judged = config.history, spread is not None
+        self.history, self.in_keys, self.samples = config.history, network.in_keys, network.samples
+        self.judged = spread is not None
         dtype, exact = network.head.weight.dtype, copy.deepcopy(network).double()
         hold_constants(self, dtype, turns=_turns(exact), octants=_octants(exact))
         embed: Any = exact.embed
         weight = embed.weight.squeeze(-1) * exact.step_feature_scale
         hold_constants(self, dtype, embed_weight=weight.mT, embed_bias=embed.bias, zero=torch.zeros(1))
-        length, self.dense, self.lengths = config.history - 1, [], [config.history - 1]
+        length = config.history // config.stride - 1
+        self.dense, self.lengths = [], [length]
         for number, layer in enumerate(exact.convolve):
             weight, bias, length, dense = _convolution(layer, length)
             self.dense.append(dense)
@@ -137,28 +139,39 @@ class InferenceForecaster(Precise, DescribedForecast):
                 constants = {f"spread_{name}_weight": layer.weight.mT, f"spread_{name}_bias": layer.bias}
                 hold_constants(self, dtype, **constants)
 
-    def forward(self, target_history: Tensor) -> Tensor:
+    def forward(self, target_history: Tensor, target_covariance: Tensor | None = None) -> Tensor:
         """Positions at the next F control steps, ``(*B, F, 3)`` [m, world], as `Forecaster.forward` describes."""
-        size = 2 if target_history.shape[-1:] == (2,) else 3
-        network_input("target_history", target_history, self.config.history, size, like=self.head_weight)
-        return self._forecast(target_history)[0]
+        self._check(target_history, target_covariance)
+        return self._forecast(target_history, target_covariance)[0]
 
-    def describe(self, target_history: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    def describe(
+        self, target_history: Tensor, target_covariance: Tensor | None = None
+    ) -> tuple[Tensor, Tensor, Tensor]:
         """The same forecast, and what a spread is told by, as `Forecaster.describe` describes."""
-        size = 2 if target_history.shape[-1:] == (2,) else 3
-        network_input("target_history", target_history, self.config.history, size, like=self.head_weight)
-        forecast, hidden, turn = self._forecast(target_history)
+        self._check(target_history, target_covariance)
+        forecast, hidden, turn = self._forecast(target_history, target_covariance)
         batch = target_history.shape[:-2]
         hidden = in_type_of(forecast, hidden).view(*batch, self.config.hidden)
         return forecast, hidden, (turn[:, 0, 0] == 0.0).view(batch)
 
-    def _forecast(self, target_history: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    def _check(self, target_history: Tensor, target_covariance: Tensor | None) -> None:
+        """Raise `InputError` for an input that is none."""
+        from torchdyn_plan.nets.forecaster import check_covariance
+
+        size = 2 if target_history.shape[-1:] == (2,) else 3
+        network_input("target_history", target_history, self.config.history, size, like=self.head_weight)
+        if self.config.tracked:
+            check_covariance(target_covariance, target_history, like=self.head_weight)
+
+    def _forecast(
+        self, target_history: Tensor, target_covariance: Tensor | None = None
+    ) -> tuple[Tensor, Tensor, Tensor]:
         """Positions (*B, F, 3), hidden features (R, hidden) and how each row was turned (R, 3, 7)."""
         config, like = self.config, self.head_weight
         if autocast_is_on():
-            return without_autocast(self._forecast, target_history)
+            return without_autocast(self._forecast, target_history, target_covariance)
         if target_history.shape[-1] == 2:
-            return in_plane(self._forecast, target_history)
+            return in_plane(self._forecast, target_history, target_covariance)
         seen = target_history
         if seen.shape[-2:] != (config.history, 3) or seen.dtype != like.dtype or seen.device != like.device:
             seen = network_input("target_history", seen, config.history, 3, like=like, finite=False)
@@ -170,9 +183,11 @@ class InferenceForecaster(Precise, DescribedForecast):
             turn = self.turns.index_select(0, direction.mm(self.octants).argmax(dim=-1))
         else:
             turn = self.turns[:1].expand(len(history), 3, 7)
-        history = torch.bmm(history, turn[..., :3])
+        history = torch.bmm(history[:, config.stride - 1 :: config.stride], turn[..., :3])
         step, now = history[:, 1:] - history[:, :-1], history[:, -1]
-        line, hidden = self._line(step, now, step[:, -1])
+        if config.stride > 1:
+            step.mul_(1.0 / config.stride)
+        line, hidden = self._line(step, now, step[:, -1], *self._known(target_covariance))
         if config.half_extent is not None:
             level = line[:, :2]
             level.sub_(level.round()).abs_()
@@ -208,7 +223,15 @@ class InferenceForecaster(Precise, DescribedForecast):
         scale, shape = scale.reshape(*batch, horizon, 2), shape.reshape(*batch, horizon, 2)
         return Spread(scale, shape, gone.view(*batch, horizon))
 
-    def _line(self, step: Tensor, now: Tensor, newest: Tensor) -> tuple[Tensor, Tensor]:
+    def _known(self, target_covariance: Tensor | None) -> tuple[Tensor, ...]:
+        """What is known of position and velocity, ``(R, 3)``, by their covariance (*B, 2, 2); nothing if not read."""
+        if target_covariance is None or not self.config.tracked:
+            return ()
+        from torchdyn_plan.nets.forecaster import how_well_known
+
+        return (how_well_known(target_covariance.to(self.head_weight).reshape(-1, 2, 2)),)
+
+    def _line(self, step: Tensor, now: Tensor, newest: Tensor, *known: Tensor) -> tuple[Tensor, Tensor]:
         """Unreflected line (R, 3, F) and hidden features; with cushions x and y count in periods of the reflection."""
         real = step.any(dim=-1, keepdim=True).to(step.dtype)
         change = torch.addcmul(self.zero, step - step[:, -1:], real, value=1.0 / self.config.change_scale).asinh()
@@ -223,7 +246,7 @@ class InferenceForecaster(Precise, DescribedForecast):
             weight, bias = getattr(self, f"convolve_weight_{number}"), getattr(self, f"convolve_bias_{number}")
             features = torch.addmm(bias, features, weight).relu_()
         features = features.view(len(step), self.lengths[-1] * self.config.channels)
-        joined = torch.cat([features, now, newest, *self._ahead(now, newest)], dim=-1)
+        joined = torch.cat([features, now, newest, *self._ahead(now, newest), *known], dim=-1)
         hidden = torch.addmm(self.join_bias, joined, self.join_weight).relu_()
         hidden = torch.addmm(self.hidden_bias, hidden, self.hidden_weight).relu_()
         mixed = torch.addmm(self.mix_bias, hidden, self.mix_weight)
@@ -373,8 +396,9 @@ def _join(network: Forecaster) -> tuple[Tensor, Tensor]:
     present = len(network.present_feature_scale)
     weight[:, -present:] *= network.present_feature_scale
     if config.half_extent is not None:
-        bias += config.half_extent * weight[:, -2:].sum(1)
-        weight[:, -2:] *= -4.0 * config.half_extent
+        end = weight.shape[1] - (3 if config.tracked else 0)
+        bias += config.half_extent * weight[:, end - 2 : end].sum(1)
+        weight[:, end - 2 : end] *= -4.0 * config.half_extent
     return weight, bias
 
 

@@ -29,6 +29,8 @@ class SpreadConfig:
     """Rank of the head."""
     finest: float = 1e-5
     """Errors are not told apart below this [m]; it is added to every error before its logarithm is taken."""
+    tracked: bool = False
+    """Whether the forecaster that it judges is."""
 
     def __post_init__(self) -> None:
         for name in ("features", "horizon", "hidden", "rank"):
@@ -98,6 +100,7 @@ class SpreadForecaster(ForecastModel):
         if not isinstance(spread, SpreadNetwork):
             raise InputError(f"spread is {type(spread).__name__}, expected a SpreadNetwork")
         self.forecaster, self.spread, self.history = forecaster, spread, forecaster.history
+        self.in_keys, self.samples = forecaster.in_keys, forecaster.samples
 
     def predict(self, *seen: Tensor) -> Forecast:
         """Path and spread."""

@@ -17,6 +17,7 @@ from torchdyn_plan.planners.maneuver import NoState
 from torchdyn_plan.planners.observation import Observation
 from torchdyn_plan.planners.plan import Plan
 from torchdyn_plan.planners.rows import where_rows
+from torchdyn_plan.planners.seconds import steps_in
 
 
 class Order(NamedTuple):
@@ -54,6 +55,14 @@ class Background:
         self.executor = executor or ThreadPoolExecutor(1, thread_name_prefix="planner")
         self.used, self.missed = 0, 0
         self._order: Order | None = None
+
+    @classmethod
+    def by_seconds(
+        cls, *, latency: float, deadline: float, control_step: float, executor: Executor | None = None
+    ) -> Background:
+        """The same with times in seconds, in control steps of ``control_step`` [s], rounded up."""
+        steps = steps_in("latency", latency, control_step), steps_in("deadline", deadline, control_step)
+        return cls(latency=steps[0], deadline=steps[1], executor=executor)
 
     def close(self) -> None:
         """Wait for the thread's last plan and end it."""

@@ -13,6 +13,7 @@ from torchdyn_plan.checks import check_number
 from torchdyn_plan.planners.observation import Observation
 from torchdyn_plan.planners.plan import Plan
 from torchdyn_plan.planners.rows import any_row, where_rows
+from torchdyn_plan.planners.seconds import steps_in
 
 MakePlans = Callable[[Tensor, Observation, Plan, Plan], Plan]
 """Makes new plans in the rows of a mask ``(*B,)``, from the observation and the plan in use; the other rows are those
@@ -91,6 +92,11 @@ class Delayed:
 
     def __post_init__(self) -> None:
         check_number("steps", self.steps, minimum=1, integer=True)
+
+    @classmethod
+    def by_seconds(cls, latency: float, *, control_step: float, compensate: bool = True) -> Delayed:
+        """Plans that take effect ``latency`` [s] after they were begun, in control steps of ``control_step`` [s]."""
+        return cls(steps_in("latency", latency, control_step), compensate)
 
     @property
     def delay(self) -> int:

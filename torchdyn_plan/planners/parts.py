@@ -22,7 +22,7 @@ from torchdyn_plan.planners.observation import SEEN_BY_ALL, Observation
 from torchdyn_plan.planners.plan import Lost
 from torchdyn_plan.planners.pretrained import PretrainedPlanner
 from torchdyn_plan.planners.protocol import keys_read, keys_written
-from torchdyn_plan.planners.schedule import ReplanSchedule, Schedule
+from torchdyn_plan.planners.schedule import ReplanSchedule, Schedule, starting_at
 from torchdyn_plan.planners.search.corner import CornerSearch
 from torchdyn_plan.planners.search.exact import ExactSearch
 from torchdyn_plan.planners.search.meeting import GoalSearch
@@ -114,6 +114,20 @@ class ComposedPlanner(PretrainedPlanner, Remembering):
             check_choice("part", name, PARTS)
         return type(self)(**(self.part_settings() | parts)).train(self.training)
 
+    def for_noise(self, noise: float) -> Self:
+        """The planner for targets that a track sees by measurements of standard deviation ``noise`` [m].
+
+        It is another one where its forecaster has another for them; that one plans as soon as a target is seen well
+        enough for it.
+        """
+        forecaster = self.forecaster.for_noise(noise)
+        if forecaster is self.forecaster:
+            return self
+        schedule = self.schedule
+        if forecaster.samples is not None:
+            schedule = starting_at(schedule, forecaster.samples - 1)
+        return self.with_parts(forecaster=forecaster, schedule=schedule)
+
     def part_settings(self) -> dict[str, Any]:
         """Arguments that make the same planner."""
         return {name: getattr(self, name) for name in PARTS}
@@ -130,7 +144,7 @@ class ComposedPlanner(PretrainedPlanner, Remembering):
 
     def prepare(self) -> Self:
         """Copy the models as they are now, for inference; in training mode leave the copies. Returns the planner."""
-        self.prepared = None if self.training else Prepared.of(self.forecaster, self.eta)
+        self.prepared = None if self.training else Prepared.of(self.forecaster.chosen, self.eta)
         return self
 
     def _apply(self, fn: Callable[[Tensor], Tensor], recurse: bool = True) -> Self:

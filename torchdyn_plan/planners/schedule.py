@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
+import dataclasses
 from collections.abc import Callable
 from dataclasses import dataclass
 from fractions import Fraction
-from typing import TYPE_CHECKING, ClassVar, NamedTuple, Protocol
+from typing import TYPE_CHECKING, Any, ClassVar, NamedTuple, Protocol
 
 import torch
 from torch import Tensor
@@ -16,6 +17,7 @@ from torchdyn_plan.errors import InputError
 from torchdyn_plan.planners.observation import Observation
 from torchdyn_plan.planners.plan import Plan
 from torchdyn_plan.planners.rows import any_row, apply_to_rows
+from torchdyn_plan.planners.seconds import steps_in
 
 if TYPE_CHECKING:
     from torchdyn_plan.nets.arrival import ArrivalModel
@@ -121,6 +123,15 @@ class ReplanSchedule:
         check_number("steps", steps, minimum=1, integer=True)
         return cls(first_step=first_step, window=steps, shrink=1.0, minimum=steps)
 
+    @classmethod
+    def every_seconds(cls, seconds: float, *, control_step: float, first: float | None = None) -> ReplanSchedule:
+        """A plan every ``seconds``, and the first one ``first`` [s] after the reset; after a step for None.
+
+        Times are whole control steps of ``control_step`` [s], rounded up.
+        """
+        first_step = 1 if first is None else steps_in("first", first, control_step)
+        return cls.every(max(steps_in("seconds", seconds, control_step), 1), first_step=first_step)
+
     @property
     def longest(self) -> int:
         """Longest time between two plans [control steps]: the first window."""
@@ -210,6 +221,15 @@ class EventSchedule:
             misfit = (miss > self.miss) | (late(looked) > self.late) | (plan.arrival_steps == 0)
             due = due | (looked & misfit)
         return Clock(window, torch.where(due, window, countdown), replans + due), due
+
+
+def starting_at(schedule: Schedule, first_step: int) -> Schedule:
+    """``schedule`` with its first plan at ``first_step``; as it is where it does not tell when it plans first."""
+    settings: Any = schedule
+    named = dataclasses.is_dataclass(schedule) and any(
+        field.name == "first_step" for field in dataclasses.fields(schedule)
+    )
+    return dataclasses.replace(settings, first_step=first_step) if named else schedule
 
 
 def lateness(eta: ArrivalModel, observation: Observation, plan: Plan, chunk: int | None, rows: Tensor) -> Tensor:

@@ -14,6 +14,7 @@ from torchdyn_plan import keys
 from torchdyn_plan.checks import check_number, check_points, check_trailing_shape
 from torchdyn_plan.errors import InputError
 from torchdyn_plan.planners.memory import Remembering, remember, warn_of_loss
+from torchdyn_plan.planners.parts import ComposedPlanner
 from torchdyn_plan.planners.plan import PlanStatus
 from torchdyn_plan.planners.pretrained import PretrainedPlanner
 from torchdyn_plan.planners.protocol import keys_written, read
@@ -37,7 +38,9 @@ class TrackedPlanner(PretrainedPlanner, Remembering):
     Reads ``measured_pos`` (*B, M, D) and ``measured_time`` (*B, M), up to M measurements that have come since the last
     step; where they are absent, ``target_pos`` is one of now. The planner sees where the target is now by the track,
     its past at each control step, and the covariance of the two; afterwards these entries are as they were. Rows
-    without a usable track are `PlanStatus.NO_TRACK`: they hold still until there is one. ``track_restarts`` and
+    without a usable track are `PlanStatus.NO_TRACK`: they hold still until there is one. A planner that has a second
+    forecaster for targets that are measured with noise, `torchdyn_plan.nets.ForecastByNoise`, uses the one for the
+    track's noise, and plans as soon as there is a track. ``track_restarts`` and
     ``track_rejected`` below ``plan`` count what did not fit.
     """
 
@@ -60,6 +63,8 @@ class TrackedPlanner(PretrainedPlanner, Remembering):
         """
         super().__init__()
         check_number("control_step", control_step, minimum=1e-6)
+        if isinstance(planner, ComposedPlanner) and isinstance(track, Track):
+            planner = planner.for_noise(track.noise)
         read_by_forecaster: int = getattr(getattr(planner, "forecaster", None), "history", None) or ANY_HISTORY
         length = read_by_forecaster if history is None else history
         check_number("history", length, minimum=2, integer=True)

@@ -24,6 +24,8 @@ if TYPE_CHECKING:
 
     from torchdyn_plan.envs.moving_target import MovingTargetEnv
 
+NOISY = "noisy_"
+"""Begin of the names of networks for targets that are measured with noise, and seen by a track."""
 NEAREST_ETA = "nearest_eta"
 """Network of the times until the robot is as near to a goal as it can come, and the end of its weights' name."""
 ENTRY_POINTS = "torchdyn_plan.tasks"
@@ -297,6 +299,23 @@ class PlannerParts:
         from torchdyn_plan.nets import SpreadForecaster, SpreadNetwork
 
         return SpreadForecaster(self.forecaster, self._load(SpreadNetwork, self._path_weights)).eval()
+
+    @property
+    def forecaster_by_noise(self) -> Any:
+        """`spread_forecaster`, and beside it the one for targets that are measured with noise, where there is one."""
+        from torchdyn_plan.nets import ForecastByNoise, Forecaster, SpreadForecaster, SpreadNetwork
+
+        if self.weights is None:
+            names = [f"{self._path_weights}-noisy"] * 2
+        else:
+            names = [self.weights / f"{NOISY}{kind}" for kind in ("forecaster", "spread")]
+            if not all(folder.is_dir() for folder in names):
+                return self.spread_forecaster
+        forecaster, spread = (
+            kind.from_pretrained(name).requires_grad_(False)
+            for kind, name in zip((Forecaster, SpreadNetwork), names, strict=True)
+        )
+        return ForecastByNoise(self.spread_forecaster, SpreadForecaster(forecaster, spread)).eval()
 
     @property
     def eta(self) -> Any:

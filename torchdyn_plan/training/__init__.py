@@ -15,6 +15,8 @@ if TYPE_CHECKING:
     from torchdyn_plan.training.optimise import Recipe
     from torchdyn_plan.training.path_data import lay_end_to_end
     from torchdyn_plan.training.runs import RunPlan, record_runs
+    from torchdyn_plan.training.sighted_data import Sighting
+    from torchdyn_plan.training.sightings import SensorRange
     from torchdyn_plan.training.windows import WindowConfig
 
 _PLACES = {
@@ -25,6 +27,8 @@ _PLACES = {
     "GoalTask": "goal_task",
     "Recipe": "optimise",
     "RunPlan": "runs",
+    "SensorRange": "sightings",
+    "Sighting": "sighted_data",
     "WindowConfig": "windows",
     "lay_end_to_end": "path_data",
     "record_runs": "runs",
@@ -39,6 +43,8 @@ __all__ = [
     "GoalTask",
     "Recipe",
     "RunPlan",
+    "SensorRange",
+    "Sighting",
     "WindowConfig",
     "lay_end_to_end",
     "record_runs",

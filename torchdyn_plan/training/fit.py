@@ -31,6 +31,7 @@ from torchdyn_plan.training.metrics import arrival_errors, forecast_errors, lost
 from torchdyn_plan.training.optimise import Recipe, optimise
 from torchdyn_plan.training.path_data import PathSamples
 from torchdyn_plan.training.shards import read_description
+from torchdyn_plan.training.sighted_data import SightedSamples
 from torchdyn_plan.training.windows import Windows
 
 ROWS = 4096
@@ -57,50 +58,68 @@ def fit_forecaster(
     *,
     config: ForecasterConfig | None = None,
     resume: bool = True,
+    name: str = Forecaster.kind,
 ) -> Path:
     """Fit a `Forecaster` to the ``paths`` in ``data``; one in ten episodes is held out and scored.
 
-    ``config`` is the task's by default; without ``resume`` a checkpoint in ``out`` is not continued.
+    One that is ``tracked`` sees the paths through sensors and a track, as the task's `Fitting.sighting` says.
+    ``config`` is the task's by default; ``name`` is that of its folder in ``out``; without ``resume`` a checkpoint in
+    ``out`` is not continued.
     """
     fitting = task_fitting(task)
     config, recipe = config or fitting.forecaster, recipe or fitting.recipe("forecaster")
     about = read_description(data, "paths", scene=task.digest())
-    drawing = replace(fitting.windows, history=config.history, horizon=config.horizon)
-    samples = PathSamples.load(data, drawing, recipe.seed)
+    samples = path_samples(task, data, config, recipe.seed)
     lines = unreflect_paths(samples.paths.positions, samples.paths.start, config.half_extent)
     torch.manual_seed(recipe.seed)
     network = Forecaster(config).to(recipe.device)
-    windows = samples.held_windows(recipe.seed)
+    regimes = samples.regimes(recipe.seed)
 
     def loss(generator: torch.Generator) -> Tensor:
-        return line_loss(network, samples.draw(recipe.batch, generator, lines=lines))
+        return line_loss(network, samples.draw(recipe.batch, generator, lines=lines), control_step=task.control_step)
 
     def score() -> Tables:
-        forecast = _in_parts(lambda rows: network(windows.history[rows].to(recipe.device)), len(windows.history))
-        errors = forecast_errors(forecast, windows, ahead=fitting.ahead, fast=fitting.fast)
+        errors, lost = [], []
+        for sensor, windows in regimes.items():
+            forecast = _forecasts(network, windows, recipe.device)
+            columns = {"sensor": sensor} if sensor else {}
+            rows = forecast_errors(forecast, windows, ahead=fitting.ahead, fast=fitting.fast)
+            errors += [columns | row for row in rows]
+            if fitting.lost is not None:
+                lost.append(columns | lost_accuracy(forecast, windows, fitting.lost))
         tables = {"Errors on held-out windows [m]": errors}
-        if fitting.lost is not None:
-            tables["Lost targets"] = [lost_accuracy(forecast, windows, fitting.lost)]
-        return tables
+        return tables | {"Lost targets": lost} if lost else tables
 
     episodes = len(samples.paths.length)
     settings = {"network": asdict(config), "scene": about["scene"], "episodes": episodes}
-    folder = out / Forecaster.kind
+    folder = out / name
     optimise(network, loss, lambda: _forecast_figures(score()), recipe, out=folder, settings=settings, resume=resume)
     counts = {"episodes": episodes, "held out": len(samples.held)}
-    return write_network(network, folder, score, task=words_of(task), recipe=recipe, facts=about | counts)
+    facts = about | counts
+    return write_network(network, folder, score, task=words_of(task), recipe=recipe, facts=facts, network_name=name)
 
 
-def line_loss(network: Forecaster, windows: Windows) -> Tensor:
-    """Mean absolute error on the unreflected line, relative to what a step ahead is worth.
+def path_samples(task: Task, data: Path, config: ForecasterConfig, seed: int) -> PathSamples | SightedSamples:
+    """The paths in ``data`` as windows for a forecaster of ``config``; ``seed`` is of what is held out."""
+    fitting = task_fitting(task)
+    drawing = replace(fitting.windows, history=config.history, horizon=config.horizon)
+    if not config.tracked:
+        return PathSamples.load(data, drawing, seed)
+    # A track is of use from its second measurement on.
+    drawing = replace(drawing, first_step=1)
+    return SightedSamples.load(data, drawing, seed, fitting.sighting, control_step=task.control_step)
+
+
+def line_loss(network: Forecaster, windows: Windows, *, control_step: float) -> Tensor:
+    """Mean absolute error on the unreflected line, relative to what a step ahead is worth, and to what is known.
 
     Level errors count until the target is lost, so that the line is where it would be if it were not; heights count
     always, so that they tell what is likelier.
     """
     device = network.head.weight.device
-    difference = network.unreflected(windows.history.to(device)) - windows.future.to(device)
-    ahead = network.steps_ahead
-    weight = windows.recorded.to(device) / (LEVEL_SCALE * (ahead + LEVEL_START))
+    difference = network.unreflected(*(part.to(device) for part in windows.seen)) - windows.future.to(device)
+    scale = LEVEL_SCALE * (network.steps_ahead + LEVEL_START) + windows.doubt(control_step).to(device)
+    weight = windows.recorded.to(device) / scale
     level = difference[..., :2].abs().sum(dim=-1).mul(weight).sum() / weight.numel()
     return level + difference[..., 2].abs().mean() / HEIGHT_SCALE
 
@@ -167,6 +186,11 @@ def fit_eta(
     return write_network(network, folder, score, task=words_of(task), recipe=recipe, facts=facts, network_name=name)
 
 
+def _forecasts(network: Forecaster, windows: Windows, device: str) -> Tensor:
+    """Forecasts of ``windows``, on the CPU."""
+    return _in_parts(lambda rows: network(*(part[rows].to(device) for part in windows.seen)), len(windows.history))
+
+
 def _in_parts(forward: Callable[[slice], Tensor], count: int) -> Tensor:
     """Outputs for ``count`` rows, `ROWS` at a time, on the CPU."""
     return torch.cat([forward(slice(first, first + ROWS)).cpu() for first in range(0, count, ROWS)])
@@ -176,11 +200,17 @@ def _forecast_figures(tables: Tables) -> dict[str, float]:
     errors, *lost = tables.values()
     figures: dict[str, Any] = {}
     for row in errors:
-        if row["windows"] != "still":
-            figures[f"{row['windows']}_{row['ahead']}"] = row["median"]
-    for (row,) in lost:
-        figures |= {"lost_found": row["found"], "lost_false": row["false"]}
+        # A curve of every kind at every sensor could not be read.
+        if row["windows"] == "fast" or (row["windows"] != "still" and "sensor" not in row):
+            figures[f"{_of(row)}{row['windows']}_{row['ahead']}"] = row["median"]
+    for row in (row for rows in lost for row in rows):
+        figures |= {f"{_of(row)}lost_found": row["found"], f"{_of(row)}lost_false": row["false"]}
     return {name: value for name, value in figures.items() if value is not None}
+
+
+def _of(row: dict[str, Any]) -> str:
+    """Begin of the name of a figure: the sensor that it is of, if any."""
+    return f"{row['sensor']}: " if "sensor" in row else ""
 
 
 def _arrival_figures(tables: Tables) -> dict[str, float]:

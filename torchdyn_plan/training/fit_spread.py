@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
-from dataclasses import asdict, replace
+from dataclasses import asdict
 from pathlib import Path
 
 import torch
@@ -15,12 +16,13 @@ from torchdyn_plan.nets.forecaster import Forecaster
 from torchdyn_plan.nets.spread import Spread, SpreadConfig, SpreadNetwork
 from torchdyn_plan.tasks.task import Task
 from torchdyn_plan.training.card import Rows, Tables, write_network
-from torchdyn_plan.training.fit import task_fitting, words_of
+from torchdyn_plan.training.fit import path_samples, task_fitting, words_of
 from torchdyn_plan.training.fitting import Fitting
 from torchdyn_plan.training.metrics import coverage, lost_probability
 from torchdyn_plan.training.optimise import Recipe, optimise
 from torchdyn_plan.training.path_data import PathSamples
 from torchdyn_plan.training.shards import read_description
+from torchdyn_plan.training.sighted_data import SightedSamples
 from torchdyn_plan.training.windows import Windows
 
 ROWS = 1024
@@ -36,6 +38,7 @@ def fit_spread(
     forecaster: str | Path,
     config: SpreadConfig | None = None,
     resume: bool = True,
+    name: str = SpreadNetwork.kind,
 ) -> Path:
     """Fit a `SpreadNetwork` to the errors that ``forecaster`` makes on the ``paths`` in ``data``; it stays as it is.
 
@@ -43,7 +46,8 @@ def fit_spread(
     measured on errors that neither network was fitted to.
 
     ``forecaster`` is a name that ships, a file or a folder: else a `WeightsError`. ``config`` has the forecaster's
-    sizes by default; without ``resume`` a checkpoint in ``out`` is not continued.
+    sizes by default; ``name`` is that of its folder in ``out``; without ``resume`` a checkpoint in ``out`` is not
+    continued.
     """
     fitting = task_fitting(task)
     if not fitting.spread:
@@ -51,10 +55,9 @@ def fit_spread(
     recipe = recipe or fitting.recipe("spread")
     frozen = Forecaster.from_pretrained(forecaster, device=recipe.device).requires_grad_(False)
     sizes = frozen.config
-    config = config or SpreadConfig(features=sizes.hidden, horizon=sizes.horizon)
+    config = config or SpreadConfig(features=sizes.hidden, horizon=sizes.horizon, tracked=sizes.tracked)
     about = read_description(data, "paths", scene=task.digest())
-    drawing = replace(fitting.windows, history=sizes.history, horizon=sizes.horizon)
-    samples = PathSamples.load(data, drawing, recipe.seed)
+    samples = path_samples(task, data, sizes, recipe.seed)
     torch.manual_seed(recipe.seed)
     network = SpreadNetwork(config).to(recipe.device)
     windows = samples.held_windows(recipe.seed)
@@ -66,45 +69,72 @@ def fit_spread(
         return {"loss_held": float(spread_loss(frozen, network, windows))}
 
     def score() -> Tables:
-        return _tables(frozen, network, windows, samples, fitting)
+        return _tables(frozen, network, samples, fitting, recipe.seed)
 
     episodes = len(samples.paths.length)
     settings = {"network": asdict(config), "scene": about["scene"], "episodes": episodes, "forecaster": str(forecaster)}
-    folder = out / SpreadNetwork.kind
+    folder = out / name
     optimise(network, loss, validate, recipe, out=folder, settings=settings, resume=resume)
     counts = {"episodes": episodes, "held out": len(samples.held), "forecaster": forecaster}
-    return write_network(network, folder, score, task=words_of(task), recipe=recipe, facts=about | counts)
+    facts = about | counts
+    return write_network(network, folder, score, task=words_of(task), recipe=recipe, facts=facts, network_name=name)
 
 
 def spread_loss(forecaster: Forecaster, network: SpreadNetwork, windows: Windows) -> Tensor:
     """Negative log-likelihood of the errors' sizes (logistic in their logarithm), and of being lost or not.
 
-    Both are proper scores, averaged over the steps ahead. Errors count until the target is lost.
+    Errors of a forecaster that sees by a track are those of the measurements, with lighter tails than the spread has:
+    there the quantiles `QUANTILES` of their logarithm count (pinball loss) in place of the likelihood, so that
+    intervals cover what they say. All are proper scores, averaged over the steps ahead. Errors count until the target
+    is lost.
     """
     device = network.head.weight.device
     with torch.no_grad():
-        forecast, features, swapped = forecaster.describe(windows.history.to(device))
+        forecast, features, swapped = forecaster.describe(*(part.to(device) for part in windows.seen))
         error = (forecast - windows.future.to(device))[..., :2].abs() + network.config.finest
     recorded = windows.recorded.to(device)
     log_scale, log_shape, gone = network.raw(features, swapped)
-    beyond = log_shape.exp() * (error.log() - log_scale)
-    likelihood = log_shape - beyond - 2.0 * softplus(-beyond)
-    size = -(likelihood.mean(-1) * recorded).sum() / recorded.sum().clamp_min(1)
+    beyond = error.log() - log_scale
+    if forecaster.config.tracked:
+        score = sum(_pinball(beyond - math.log(share / (1.0 - share)) / log_shape.exp(), share) for share in QUANTILES)
+    else:
+        beyond = log_shape.exp() * beyond
+        score = 2.0 * softplus(-beyond) + beyond - log_shape
+    size = (score.mean(-1) * recorded).sum() / recorded.sum().clamp_min(1)
     return size + binary_cross_entropy_with_logits(gone, (~recorded).to(gone.dtype))
 
 
+QUANTILES = (0.5, 0.8, 0.95)
+"""Shares of errors that lie within the intervals by which the spread of a tracked forecaster is fitted."""
+
+
+def _pinball(beyond: Tensor, share: float) -> Tensor:
+    """Loss whose mean is least where a ``share`` of the values ``beyond`` (*B,) is negative."""
+    return torch.maximum(share * beyond, (share - 1.0) * beyond)
+
+
 def _tables(
-    forecaster: Forecaster, network: SpreadNetwork, windows: Windows, samples: PathSamples, fitting: Fitting
+    forecaster: Forecaster,
+    network: SpreadNetwork,
+    samples: PathSamples | SightedSamples,
+    fitting: Fitting,
+    seed: int,
 ) -> Tables:
     def covered(seen: Windows) -> tuple[Spread, Rows]:
-        forecast, spread = predict(forecaster, network, seen.history)
+        forecast, spread = predict(forecaster, network, *seen.seen)
         return spread, coverage(forecast, spread, seen, ahead=fitting.ahead, fast=fitting.fast, near=fitting.near)
 
-    spread, rows = covered(windows)
-    tables = {"Coverage on held-out windows": rows}
+    covers: Rows = []
+    lost: Rows = []
+    for name, windows in samples.regimes(seed).items():
+        spread, rows = covered(windows)
+        columns = {"sensor": name} if name else {}
+        covers += [columns | row for row in rows]
+        lost += [columns | row for row in lost_probability(spread, windows, ahead=fitting.ahead)]
+    tables = {"Coverage on held-out windows": covers}
     if fitting.lost is not None:
-        tables["Lost targets"] = lost_probability(spread, windows, ahead=fitting.ahead)
-    if fitting.extra_coverage is not None:
+        tables["Lost targets"] = lost
+    if fitting.extra_coverage is not None and not forecaster.config.tracked:
         extra = fitting.extra_coverage(samples.drawing)
         tables[extra.caption] = [
             columns | row for columns, seen in extra.windows for row in covered(seen)[1] if row["windows"] == "full"
@@ -112,12 +142,12 @@ def _tables(
     return tables
 
 
-def predict(forecaster: Forecaster, network: SpreadNetwork, history: Tensor) -> tuple[Tensor, Spread]:
-    """Forecasts ``(n, F, 3)`` [m, world] and their spread for histories ``(n, H, 3)``, on the CPU."""
+def predict(forecaster: Forecaster, network: SpreadNetwork, *seen: Tensor) -> tuple[Tensor, Spread]:
+    """Forecasts ``(n, F, 3)`` [m, world] and their spread for what is ``seen`` of n targets, on the CPU."""
     device = network.head.weight.device
     parts: list[Sequence[Tensor]] = []
-    for rows in history.split(ROWS):
-        forecast, features, swapped = forecaster.describe(rows.to(device))
+    for rows in zip(*(part.split(ROWS) for part in seen), strict=True):
+        forecast, features, swapped = forecaster.describe(*(part.to(device) for part in rows))
         parts.append([forecast.cpu(), *(part.cpu() for part in network(features, swapped))])
     forecast, *spread = (torch.cat(tensors) for tensors in zip(*parts, strict=True))
     return forecast, Spread(*spread)

@@ -12,9 +12,11 @@ from torchdyn_plan.checks import check_choice, check_number
 from torchdyn_plan.nets.eta import ETAConfig
 from torchdyn_plan.nets.forecaster import ForecasterConfig
 from torchdyn_plan.planners import Lost
+from torchdyn_plan.tasks.task import NOISY
 from torchdyn_plan.training.arrival_data import Arrivals
 from torchdyn_plan.training.metrics import FAST, NEAR, arrival_groups
 from torchdyn_plan.training.optimise import Recipe
+from torchdyn_plan.training.sighted_data import Sighting
 from torchdyn_plan.training.windows import WindowConfig, Windows
 
 RECIPES = {
@@ -46,6 +48,10 @@ class Fitting:
     """Of the forecaster, unless another is asked for."""
     eta: ETAConfig = field(default_factory=ETAConfig)
     """Of the arrival-time network, unless another is asked for."""
+    noisy_forecaster: ForecasterConfig | None = None
+    """Of a second forecaster, for targets that are measured with noise and seen by a track; None for none."""
+    sighting: Sighting = field(default_factory=Sighting)
+    """How that one sees the recorded paths."""
     spread: bool = False
     """Whether a spread can be fitted to the forecaster's errors; its sizes are the forecaster's."""
     windows: WindowConfig = field(default_factory=WindowConfig)
@@ -67,7 +73,7 @@ class Fitting:
 
     def recipe(self, network: str) -> Recipe:
         """How the network of that name is fitted."""
-        return self.recipes.get(network, RECIPES[network])
+        return self.recipes.get(network, RECIPES[network.removeprefix(NOISY)])
 
     def __post_init__(self) -> None:
         for network in self.recipes:

@@ -65,6 +65,10 @@ class PathSamples:
         episodes = self.train[torch.randint(len(self.train), (count,), generator=generator)]
         return draw_windows(self.paths, self.last, episodes, self.drawing, generator, lines=lines)
 
+    def regimes(self, seed: int) -> dict[str, Windows]:
+        """Held-out windows by what is told of them in the tables of scores: all of one kind here."""
+        return {"": self.held_windows(seed)}
+
     def held_windows(self, seed: int) -> Windows:
         """`SCORED` windows with full histories and as many with padded ones, of episodes that are held out."""
         draws = torch.Generator().manual_seed(seed)
@@ -74,7 +78,7 @@ class PathSamples:
         for kind in (full, padded):
             episodes = _some(self.held[self.last[self.held] >= kind.first_step], SCORED)
             scored.append(draw_windows(self.paths, self.last, episodes, kind, draws))
-        return Windows(*(torch.cat(tensors) for tensors in zip(*scored, strict=True)))
+        return Windows.joined(scored)
 
 
 def _some(rows: Tensor, count: int) -> Tensor:

@@ -8,7 +8,7 @@ from typing import Any
 
 from torchdyn_plan.errors import InputError
 from torchdyn_plan.files import is_file
-from torchdyn_plan.tasks.task import NEAREST_ETA, Task, load_task
+from torchdyn_plan.tasks.task import NEAREST_ETA, NOISY, Task, load_task
 
 
 def networks(task: Task) -> tuple[str, ...]:
@@ -16,7 +16,7 @@ def networks(task: Task) -> tuple[str, ...]:
     fitted: tuple[str, ...] = ()
     if task.fitting is not None:
         # Paths may come from a file, too.
-        fitted += ("forecaster", "spread")
+        fitted += ("forecaster", "spread", f"{NOISY}forecaster", f"{NOISY}spread")
         if task.record_arrivals is not None:
             fitted += ("eta", NEAREST_ETA)
     return (*fitted, *task.policies)
@@ -45,8 +45,9 @@ def train(
 
     Args:
         task: whose network, or its name.
-        network: ``forecaster``, ``eta``, ``nearest_eta``, ``spread``, or one of the task's policies. A spread is
-            fitted to the errors of the forecaster in ``out``, or of the one that ships if there is none.
+        network: ``forecaster``, ``eta``, ``nearest_eta``, ``spread``, ``noisy_forecaster`` and ``noisy_spread`` for
+            targets that are measured with noise, or one of the task's policies. A spread is fitted to the errors of
+            the forecaster in ``out``, or of the one that ships if there is none.
         data: folder of the collected shards; a policy reads none.
         out: gets a folder of the network's name with checkpoint, curve, weights and card.
         steps: optimiser steps, of a policy rounds; the recipe's own for None, as are ``batch`` and ``lr``.
@@ -88,14 +89,20 @@ def train(
     fitting = fit.task_fitting(task)
     own = fitting.recipe("eta" if network == NEAREST_ETA else network)
     recipe = changed(own, steps=steps, lr=lr, device=device, **given)
-    if network == "forecaster":
-        return fit.fit_forecaster(task, data, out, recipe, resume=resume)
+    kind = network.removeprefix(NOISY)
+    if kind != network and fitting.noisy_forecaster is None:
+        raise InputError(f"{task.name} has no forecaster for targets that are measured with noise")
+    if kind == "forecaster":
+        config = fitting.forecaster if kind == network else fitting.noisy_forecaster
+        return fit.fit_forecaster(task, data, out, recipe, config=config, resume=resume, name=network)
     if network in ("eta", NEAREST_ETA):
         config = dataclasses.replace(fitting.eta, never=network == "eta")
         return fit.fit_eta(task, data, out, recipe, config=config, static=static, resume=resume, name=network)
-    beside = out / "forecaster" / "forecaster.safetensors"
-    forecaster = beside if is_file(beside) else task.path_weights or task.weights_name
-    return fit_spread.fit_spread(task, data, out, recipe, forecaster=forecaster, resume=resume)
+    noisy = "" if kind == network else NOISY
+    beside = out / f"{noisy}forecaster" / "forecaster.safetensors"
+    ships = (task.path_weights or task.weights_name) + ("-noisy" if noisy else "")
+    forecaster = beside if is_file(beside) else ships
+    return fit_spread.fit_spread(task, data, out, recipe, forecaster=forecaster, resume=resume, name=network)
 
 
 def _refuse_policy_arguments(network: str, **given: Any) -> None:

@@ -1,5 +1,8 @@
 """Windows of a target's recorded path: the history that a forecaster sees and the future that it should emit."""
 
+from __future__ import annotations
+
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import NamedTuple
@@ -42,6 +45,27 @@ class Windows(NamedTuple):
     """(*B,) bool: the target is lost within the window."""
     moving: Tensor
     """(*B,) bool: the target moves at the window's present."""
+    covariance: Tensor | None = None
+    """(*B, 2, 2) of position and velocity at the present, where a track saw the target [m², m²/s; m²/s, m²/s²]."""
+
+    @classmethod
+    def joined(cls, parts: Sequence[Windows]) -> Windows:
+        """All of them, one after the other; either all or none were seen by a track."""
+        fields = zip(*parts, strict=True)
+        return cls(*(None if values[0] is None else torch.cat(values) for values in fields))
+
+    @property
+    def seen(self) -> tuple[Tensor, ...]:
+        """What a forecaster reads of them."""
+        return (self.history,) if self.covariance is None else (self.history, self.covariance)
+
+    def doubt(self, control_step: float) -> Tensor:
+        """Standard deviation (*B, F) of the future along each axis by what the track knows of the present [m]."""
+        if self.covariance is None:
+            return torch.zeros_like(self.future[..., 0])
+        time = control_step * torch.arange(1.0, self.future.shape[-2] + 1.0)
+        place, both, speed = (self.covariance[..., i, j, None] for i, j in ((0, 0), (0, 1), (1, 1)))
+        return (place + 2.0 * time * both + time.square() * speed).clamp_min(0.0).sqrt()
 
 
 @dataclass(frozen=True, kw_only=True)

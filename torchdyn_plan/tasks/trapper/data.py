@@ -121,6 +121,9 @@ def trapper_fitting(scene: TrapperScene | str | None = None) -> Fitting:
 
     return Fitting(
         forecaster=ForecasterConfig(square_symmetry=True, half_extent=scene.half_side - scene.ball_radius),
+        noisy_forecaster=ForecasterConfig(
+            history=48, stride=2, tracked=True, square_symmetry=True, half_extent=scene.half_side - scene.ball_radius
+        ),
         eta=ETAConfig(),
         spread=True,
         near=waiting_search(scene).footprint,
@@ -148,4 +151,4 @@ def rolled_windows(scene: TrapperScene, drawing: WindowConfig, *, friction: floa
         episodes = (paths.length > present + 1).nonzero().squeeze(-1)
         now = torch.full_like(episodes, present)
         parts.append(cut_windows(paths, episodes, now, now.clamp(max=drawing.history), drawing))
-    return Windows(*(torch.cat(tensors) for tensors in zip(*parts, strict=True)))
+    return Windows.joined(parts)

@@ -169,7 +169,7 @@ def exact(parts: PlannerParts) -> Any:
 
 def wait_and_drop(parts: PlannerParts) -> Any:
     """Waits above the most promising meeting, and drops in time: the best that there is."""
-    return waits_and_drops(parts, parts.spread_forecaster, parts.eta)
+    return waits_and_drops(parts, parts.forecaster_by_noise, parts.eta)
 
 
 def untrained(parts: PlannerParts) -> Any:
