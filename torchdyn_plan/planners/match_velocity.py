@@ -133,10 +133,20 @@ class MatchVelocity:
         came = torch.where(rises.unsqueeze(-1), place, came)
         velocity = torch.where(rises.unsqueeze(-1), later - place, state.match_velocity)
         phase = self.phase(step).unsqueeze(-1)
-        goal = torch.where(phase == MatchPhase.DOWN, self._down(step, came, place, up), plan.goal)
+        above, turn = plan.goal.split([tool_pos.shape[-1], plan.goal.shape[-1] - tool_pos.shape[-1]], dim=-1)
+        goal = torch.where(phase == MatchPhase.DOWN, self._down(step, came, place, up), above)
         goal = torch.where(phase == MatchPhase.HOLD, place, goal)
         goal = torch.where(phase == MatchPhase.LIFT, self._lifted(step, came, velocity, up), goal)
-        return goal, MatchState(step, came, velocity)
+        return torch.cat([goal, turn], dim=-1) if turn.shape[-1] else goal, MatchState(step, came, velocity)
+
+    def committed(self, state: MatchState) -> Tensor:
+        """As of `torchdyn_plan.planners.choice.Commits`: from when it comes down until it has risen."""
+        return (state.match_step >= 0) & ~self.finished(state)
+
+    def finished(self, state: MatchState) -> Tensor:
+        """As of `torchdyn_plan.planners.choice.Commits`: it has risen."""
+        steps = self.descent_steps if self.lift_steps is None else self.lift_steps
+        return state.match_step >= self.descent_steps + self.hold_steps + steps
 
     def phase(self, match_step: Tensor) -> Tensor:
         """`MatchPhase` of ``plan.match_step`` (*B,): ``(*B,)`` int64."""

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, NamedTuple
+from typing import TYPE_CHECKING, ClassVar, NamedTuple
 
 import torch
 from torch import Tensor
@@ -64,6 +64,8 @@ class ExactSearch:
     before the target comes, by the whole distribution of the arrival time, and that the target is within the footprint
     then, by the spread of the forecast.
     """
+
+    reads_turn: ClassVar[bool] = True
 
     stride: int = 5
     """Control steps between candidates; an arrival bin's width loses nothing."""
@@ -158,6 +160,9 @@ class ExactSearch:
         """
         check_context(forecast.path, target_pos, context)
         candidates = self.candidates(forecast.path, target_pos, context.lost)
+        if context.turn is not None:
+            turns = context.turn[..., (candidates.steps - 1).clamp_min(0), :]
+            candidates = candidates._replace(goals=torch.cat([candidates.goals, turns], dim=-1))
         kept = None
         if context.planned_steps is not None:
             # Nearer in time to the meeting planned before than any other candidate, or as near: the same meeting.
@@ -175,7 +180,7 @@ class ExactSearch:
             probability = None
             if self.probability_weight > 0.0:
                 time = candidates.target_steps - self.descent_steps
-                offset = (candidates.goals - candidates.places)[..., :2]
+                offset = candidates.goals[..., :2] - candidates.places[..., :2]
                 spread = None if forecast.spread is None else forecast.spread.at(candidates.steps)
                 probability = meeting_probability(arrival, eta_steps, time, spread, offset, half_width=self.footprint)
             best, reachable = self._choose(candidates, kept, eta_steps, probability)
@@ -193,7 +198,7 @@ class ExactSearch:
         eta_steps = arrival.steps.masked_fill(arrival.never, torch.inf)
         if tool_pos is None or self.arrival_radius == 0.0:
             return eta_steps, arrival
-        away = (goals - tool_pos.unsqueeze(-2))[..., :2].square().sum(-1)
+        away = (goals[..., :2] - tool_pos.unsqueeze(-2)[..., :2]).square().sum(-1)
         return eta_steps.masked_fill(away < self.arrival_radius**2, 0.0), arrival
 
     def _choose(
