@@ -89,9 +89,7 @@ KEYS: tuple[Key, ...] = (
     Key(name=TARGETS_PRESENT, shape=("K",), meaning="whether there is a target in each slot", writer="env"),
     Key(name=TARGETS_VALUE, shape=("K",), meaning="what each target is worth", writer="env"),
     Key(name=TARGETS_POS, shape=("K", "D"), meaning="centres of the targets [m, world]", writer="env"),
-    Key(
-        name=TARGETS_HISTORY, shape=("K", "H", "D"), meaning="their positions, oldest first [m, world]", writer="env"
-    ),
+    Key(name=TARGETS_HISTORY, shape=("K", "H", "D"), meaning="their positions, oldest first [m, world]", writer="env"),
     Key(name=TARGETS_QUAT, shape=("K", 4), meaning="how they are turned: quaternions wxyz, world", writer="env"),
     Key(name=TARGET_FUTURE, shape=("F", "D"), meaning="recorded truth, from step 0 on [m, world]", writer="evaluation"),
     Key(name=TRUE_FUTURE, shape=("F", "D"), meaning="the truth from the next step on [m, world]", writer="evaluation"),

@@ -33,9 +33,9 @@ def quat_matrix(quat: Tensor) -> Tensor:
 
 
 def quat_between(start: Tensor, end: Tensor) -> Tensor:
-    """The least turn that brings directions ``start`` (*B, 3) to ``end`` (*B, 3): ``(*B, 4)``; half a turn for opposites.
+    """The least turn that brings directions ``start`` (*B, 3) to ``end`` (*B, 3), of any length: ``(*B, 4)``.
 
-    Neither needs to be of length 1.
+    Of opposite directions it is half a turn.
     """
     start, end = (torch.nn.functional.normalize(value, dim=-1) for value in torch.broadcast_tensors(start, end))
     scalar = 1.0 + (start * end).sum(-1, keepdim=True)
@@ -43,7 +43,9 @@ def quat_between(start: Tensor, end: Tensor) -> Tensor:
     smallest = torch.nn.functional.one_hot(start.abs().argmin(-1), 3).to(start.dtype)
     across = torch.linalg.cross(start, smallest)
     opposite = scalar < SHORTEST
-    quat = torch.where(opposite, torch.nn.functional.pad(across, (1, 0)), torch.cat([scalar, torch.linalg.cross(start, end)], -1))
+    quat = torch.where(
+        opposite, torch.nn.functional.pad(across, (1, 0)), torch.cat([scalar, torch.linalg.cross(start, end)], -1)
+    )
     return torch.nn.functional.normalize(quat, dim=-1)
 
 

@@ -106,7 +106,11 @@ class ChoosingPlanner(PretrainedPlanner, Remembering):
         chosen = before.choice_target
         there = (chosen >= 0) & present.gather(-1, chosen.clamp_min(0).unsqueeze(-1)).squeeze(-1)
         due = ~committed & (finished | ~there | (before.choice_age >= self.every))
-        target = self._choose(tensordict, present, due, torch.where(finished | ~there, NONE, chosen))
+        # A target that is the only one needs no comparison.
+        several = present.sum(-1) > 1
+        only = torch.where(present.any(-1), present.long().argmax(-1), NONE)
+        chosen_yet = torch.where(finished | ~there, NONE, chosen)
+        target = self._choose(tensordict, present, due & several, torch.where(due & ~several, only, chosen_yet))
         target = torch.where(committed, chosen, target)
         anew = (target != chosen) | finished
         self._act(tensordict, target, anew, step_count)

@@ -92,7 +92,9 @@ class ComposedPlanner(PretrainedPlanner, Remembering):
         if turn is not None and not getattr(self.search, "reads_turn", False):
             raise InputError(f"{type(self.search).__name__} knows no turn of the tool: search with an ExactSearch")
         if turn is None and keys.GOAL_POSE in self.static.in_keys:
-            raise InputError(f"{type(static).__name__} reads {keys.GOAL_POSE}: give the planner a turn, as WithTarget()")
+            raise InputError(
+                f"{type(static).__name__} reads {keys.GOAL_POSE}: give the planner a turn, as WithTarget()"
+            )
         self.memory = PlannerMemory(self.schedule, self.maneuver, delivery, turned=turn is not None)
         remembered = [(keys.PLAN, name) for name in self.memory.names]
         reported = [(keys.PLAN, name) for name in REPORTED]

@@ -132,7 +132,10 @@ def add_panda(spec: mujoco.MjSpec, scene: ConveyorScene) -> None:
         speed.set_to_velocity(kv=damping)
     half = TOOL_TURN / 2
     tool = parent.add_body(
-        name=TOOL, pos=[0, 0, PANDA_FLANGE + scene.tool_length], quat=[math.cos(half), 0, 0, math.sin(half)], gravcomp=1.0
+        name=TOOL,
+        pos=[0, 0, PANDA_FLANGE + scene.tool_length],
+        quat=[math.cos(half), 0, 0, math.sin(half)],
+        gravcomp=1.0,
     )
     tool.mass, tool.ipos, tool.inertia, tool.explicitinertial = 0.4, [0, 0, -0.05], [4e-4] * 3, True
     length = scene.tool_length

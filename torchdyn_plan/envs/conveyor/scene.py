@@ -24,7 +24,7 @@ MOST_PARTS = 8
 class ConveyorScene:
     """Geometry and physics; the Panda stands in the world's origin, and the belt runs along y before it."""
 
-    belt_x: float = 0.5
+    belt_x: float = 0.45
     """Middle of the belt [m]."""
     belt_half_width: float = 0.2
     """[m]"""
@@ -38,7 +38,7 @@ class ConveyorScene:
     """[kg]"""
     first_from: float = -1.0
     """The first part of an episode starts no farther upstream than this [m]."""
-    first_to: float = -0.3
+    first_to: float = -0.4
     """And no farther downstream [m]."""
     feed_from: float = 1.2
     """Each part comes at least so long after the one before [s]."""
@@ -58,7 +58,7 @@ class ConveyorScene:
     """… for so many control steps on end."""
     lift_height: float = 0.08
     """A held part so far above the belt is taken [m]."""
-    home: tuple[float, ...] = (0.0, -0.2, 0.0, -2.2, 0.0, 2.0, 0.7854)
+    home: tuple[float, ...] = (0.0, -0.2550, 0.0, -2.4366, 0.0, 2.1816, 0.7854)
     """Initial joint angles [rad]."""
     stiffness: tuple[float, ...] = (9000.0, 9000.0, 7000.0, 7000.0, 3000.0, 2500.0, 1500.0)
     """Position gain of each servo [N·m/rad]."""

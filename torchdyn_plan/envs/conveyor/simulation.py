@@ -22,9 +22,7 @@ class ConveyorSimulation:
     parts' centres] are views of the simulation: they change with every step, without copies.
     """
 
-    def __init__(
-        self, num_envs: int, scene: ConveyorScene, *, speed: float, parts: int, num_threads: int = 0
-    ) -> None:
+    def __init__(self, num_envs: int, scene: ConveyorScene, *, speed: float, parts: int, num_threads: int = 0) -> None:
         """Compile ``scene`` with a belt at ``speed`` [m/s] and ``parts`` parts; ``num_threads`` 0 means all cores."""
         self.scene, self.num_envs, self.parts, self.speed = scene, num_envs, parts, speed
         self.model = scene.compile(speed=speed, parts=parts)
@@ -46,7 +44,7 @@ class ConveyorSimulation:
         ).unbind(-1)
 
     def reset(self, rows: Tensor, place: Tensor, yaw: Tensor) -> None:
-        """Put ``rows`` (M,) back: arms at home and at rest, parts at ``place`` (M, K, 2) [m], turned by ``yaw`` (M, K)."""
+        """Put ``rows`` (M,) back: arms at home, parts at ``place`` (M, K, 2) [m], turned by ``yaw`` (M, K) [rad]."""
         self.batch.reset(rows.numpy())
         self.joint_pos[rows], self._place[rows], self._speed[rows] = self._home, self._home, 0.0
         self._ctrl[rows] = 0.0
@@ -70,7 +68,7 @@ class ConveyorSimulation:
         self.batch.step(None, nstep=self.substeps)
 
     def hold(self, held: Tensor, tool_pos: Tensor, tool_rotation: Tensor) -> None:
-        """Fix the parts ``held`` (N, K) to the tools at ``tool_pos`` (N, 3) and ``tool_rotation`` (N, 3, 3) as they are."""
+        """Fix parts ``held`` (N, K), as they are, to tools at ``tool_pos`` (N, 3) and ``tool_rotation`` (N, 3, 3)."""
         if not held.any():
             return
         row, part = held.nonzero(as_tuple=True)

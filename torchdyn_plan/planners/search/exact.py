@@ -77,6 +77,8 @@ class ExactSearch:
     """Goals are clamped to the square of this half-side, where the tool can be; None to leave them [m]."""
     offset: tuple[float, ...] | None = None
     """From the target to the goal, where the tool waits, a number for each axis [m]; None for no way at all."""
+    early_steps: int = 0
+    """The goal is where the target is so many control steps before they meet: from there the tool goes along."""
     descent_steps: float = 0.0
     """Control steps that the robot needs from the goal to the target."""
     margin: float = 0.0
@@ -112,7 +114,8 @@ class ExactSearch:
     def __post_init__(self) -> None:
         for name in ("stride", "coarse", "longest_dwell"):
             check_number(name, getattr(self, name), minimum=1, integer=True)
-        check_number("first", self.first, minimum=0, integer=True)
+        for name in ("first", "early_steps"):
+            check_number(name, getattr(self, name), minimum=0, integer=True)
         check_number("axis_edge", self.axis_edge, minimum=1e-9)
         for name in (
             "descent_steps",
@@ -230,7 +233,8 @@ class ExactSearch:
         first = min(self.first, path.shape[-2])
         steps = torch.arange(first, whole.shape[-2], self.stride, device=path.device)
         places = whole[..., first :: self.stride, :]
-        goals, gone = self.goals(places), None if lost is None else lost.forecast(whole)
+        waited = places if self.early_steps == 0 else whole[..., (steps - self.early_steps).clamp_min(0), :]
+        goals, gone = self.goals(waited), None if lost is None else lost.forecast(whole)
         cost = self.waiting_cost * steps
         if self.base_pos is not None:
             x, y = self.base_pos

@@ -17,7 +17,7 @@ class Meeting(NamedTuple):
     """Where and when robot and target meet."""
 
     goal: Tensor
-    """``(*B, D)`` [m, world]: where they meet; where the context says how the tool is turned, its quaternion follows."""
+    """``(*B, D)`` [m, world]: where they meet; with a turn in the context the tool's quaternion follows."""
     arrival_steps: Tensor
     """``(*B,)`` int64: control steps from now to the meeting, at most the horizon."""
     clamped: Tensor

@@ -58,10 +58,12 @@ class IKPlanner(Precise, StaticPlannerModule):
     """Drives an arm's tool to ``goal`` by inverse kinematics, in the way that its approach says.
 
     Reads ``joint_pos`` (*B, N) [rad], ``goal`` (*B, 3) [m, world] and ``step_count`` (*B,); writes ``action`` (*B, N)
-    and its memory under ``plan``. With an approach that turns the tool, `TurnedToGoal`, it reads ``goal_pose`` (*B, 7)
-    in place of ``goal``, and so do its methods. The arm follows a path of `PATH_LENGTH` steps from where it was when the path began,
+    and its memory under ``plan``. The arm follows a path of `PATH_LENGTH` steps from where it was when the path began,
     whatever it does meanwhile; the path is flushed when the goal changes (paper, Section III-B.1), and rows with
     ``step_count`` 0 start afresh. A control step solves that step of the path alone: a flushed path costs nothing.
+
+    With an approach that turns the tool, `TurnedToGoal`, it reads ``goal_pose`` (*B, 7) in place of ``goal``, and so do
+    its methods.
     """
 
     PATH_LENGTH = 5
@@ -88,7 +90,7 @@ class IKPlanner(Precise, StaticPlannerModule):
             control_step: time between two actions [s].
             damping: λ of the least squares.
             gain: share of the remaining joint error that one step may cover, which brakes the arm at the end.
-            acceleration: limit of each joint, or of all of them [rad/s²]: the arm brakes by it, and not by ``gain``, and
+            acceleration: limit of each joint, or of all of them [rad/s²]: the arm brakes by it and not by ``gain``, and
                 goes along with a goal that moves, a control step behind it. None for the gain alone.
             chunk: solve in blocks of exactly this many rows, so that results do not depend on the batch size.
             compiled: solve in one compiled loop, which takes a C++ compiler and some seconds at the first call (less
@@ -177,7 +179,7 @@ class IKPlanner(Precise, StaticPlannerModule):
         return self._limit.new_tensor(values) * self.control_step**2
 
     def _recall(self, plan: Any, joint_pos: Tensor, goal: Tensor, step_count: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-        """Where the path stands, (*B, N), its step (*B,), and the goal of the step before, that of now if there is none.
+        """Where the path stands, (*B, N), its step (*B,), and the goal of the step before, or that of now.
 
         Where ``plan`` holds none to follow, a new path begins.
         """
@@ -270,7 +272,7 @@ class IKPlanner(Precise, StaticPlannerModule):
     def _step_braked(
         self, joint_pos: Tensor, goal: Tensor, before: Tensor, pose: Tensor, jacobian: Tensor
     ) -> tuple[Tensor, Tensor]:
-        """`step` by the acceleration: what is left to the last goal is braked, and its motion since then added whole."""
+        """`step` by the acceleration: the way to the last goal is braked, and what it moved since then is added."""
         error, old = self._way(pose, goal), self._way(pose, before.to(goal.dtype))
         moved = error - old
         moves = moved[..., :3].norm(dim=-1, keepdim=True) <= GOAL_SPEED * self.control_step

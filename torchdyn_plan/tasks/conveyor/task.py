@@ -14,8 +14,6 @@ REACH = (0.4, 0.45)
 """Parts are met no farther upstream and downstream than this [m]: the tool goes along with them before and after."""
 MARGIN = 0.8
 """Share of the joints' acceleration limits by which the static planner brakes: servos lag a little."""
-PARTS_SOLVABLE, PARTS_TAKEN = "parts_solvable", "parts_taken"
-"""Evidence: how many parts of an episode could be taken each by itself, and how many of these were."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -64,11 +62,12 @@ def ik(*, chunk: int | None = None, weights: Any = None) -> Any:
     )
 
 
-def maneuver(lead_steps: int = 1) -> Any:
+def maneuver() -> Any:
     """Hovers, comes down with the belt's speed, holds until the cups do, and lifts."""
     from torchdyn_plan.planners import MatchVelocity
 
-    return MatchVelocity(hover=0.12, descent_steps=30, hold_steps=8, lift_steps=20, lead_steps=lead_steps)
+    how: dict[str, Any] = {"along_by": 0.8, "down_after": 0.3, "early_steps": 12}
+    return MatchVelocity(hover=0.1, descent_steps=40, hold_steps=8, lift_steps=20, **how)
 
 
 def dynamic(parts: PlannerParts, forecaster: Any) -> Any:
@@ -122,6 +121,14 @@ def truth(settings: ConveyorSettings, **episodes: Any) -> Truth:
     return find_truth(settings, **episodes)
 
 
+def judge(settings: ConveyorSettings, log: Any, truth: Truth) -> Verdict:
+    """As `Task.judge` says."""
+    import torch
+
+    cause = torch.where(truth.solvable, 1, 0).masked_fill(log.success, -1)
+    return Verdict(cause, {}, {})
+
+
 TASK = Task(
     name="conveyor",
     summary="A Panda takes parts off a belt.",
@@ -134,4 +141,8 @@ TASK = Task(
     static_planners={"ik": ik},
     planners={"pursuit": pursuit, "meet": meet, "first": first},
     rivals=("first",),
+    rows_at_once=(32, 64),
+    truth=truth,
+    causes=("out of reach", "missed"),
+    judge=judge,
 )
