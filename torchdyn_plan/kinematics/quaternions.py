@@ -11,9 +11,9 @@ SHORTEST = 1e-6
 
 def quat_multiply(first: Tensor, second: Tensor) -> Tensor:
     """The rotation ``second`` and then ``first``, quaternions ``(*B, 4)`` each: as R₁R₂ of matrices."""
+    first, second = torch.broadcast_tensors(first, second)
     w, v = first[..., :1], first[..., 1:]
     u, x = second[..., :1], second[..., 1:]
-    v, x = torch.broadcast_tensors(v, x)
     scalar = w * u - (v * x).sum(-1, keepdim=True)
     return torch.cat([scalar, w * x + u * v + torch.linalg.cross(v, x)], dim=-1)
 

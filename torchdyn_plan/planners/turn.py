@@ -2,16 +2,18 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any, ClassVar, Protocol
 
+import torch
 from torch import Tensor
 
 from torchdyn_plan import keys
-from torchdyn_plan.checks import check_number, check_trailing_shape
+from torchdyn_plan.checks import check_number, check_trailing_shape, check_vector
 from torchdyn_plan.errors import InputError
-from torchdyn_plan.kinematics.quaternions import quat_multiply
+from torchdyn_plan.kinematics.quaternions import quat_matrix, quat_multiply
 
 
 class Turn(Protocol):
@@ -44,6 +46,11 @@ class WithTarget:
 
     quat: tuple[float, float, float, float] = (0.0, 1.0, 0.0, 0.0)
     """How the tool is turned in the target's frame, quaternion wxyz."""
+    symmetry: int = 1
+    """The tool is the same after one ``symmetry``-th of a turn about its z axis …"""
+    facing: tuple[float, float, float] = (1.0, 0.0, 0.0)
+    """… and of its turns that are alike it takes that whose x axis is nearest to this direction in the world: so that
+    no joint is turned farther and farther from target to target."""
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "quat", tuple(self.quat))
@@ -51,10 +58,24 @@ class WithTarget:
             raise InputError(f"quat must be a quaternion wxyz other than zero, got {self.quat!r}")
         for value in self.quat:
             check_number("quat", value)
+        check_number("symmetry", self.symmetry, minimum=1, integer=True)
+        object.__setattr__(self, "facing", check_vector("facing", self.facing))
 
     def __call__(self, path: Tensor, target_pos: Tensor, *seen: Tensor) -> Tensor:
         """As of `Turn`."""
         (target_quat,) = seen
         check_trailing_shape(keys.TARGET_QUAT, target_quat, 4)
         quat = quat_multiply(target_quat, target_quat.new_tensor(self.quat).expand_as(target_quat))
+        if self.symmetry > 1:
+            quat = self._nearest(quat)
         return quat.unsqueeze(-2).expand(*path.shape[:-1], 4)
+
+    def _nearest(self, quat: Tensor) -> Tensor:
+        """Of the turns that are alike to ``quat`` (*B, 4) for the tool the one that faces as it should."""
+        half = math.pi / self.symmetry * torch.arange(self.symmetry, dtype=quat.dtype, device=quat.device)
+        zero = torch.zeros_like(half)
+        alike = torch.stack([half.cos(), zero, zero, half.sin()], dim=-1)
+        quats = quat_multiply(quat.unsqueeze(-2), alike)
+        faces = (quat_matrix(quats)[..., 0] * quats.new_tensor(self.facing)).sum(-1)
+        best = faces.argmax(-1)[..., None, None]
+        return quats.gather(-2, best.expand(*best.shape[:-1], 4)).squeeze(-2)

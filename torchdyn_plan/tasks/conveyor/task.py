@@ -49,17 +49,24 @@ def arm() -> Any:
 
 
 def ik(*, chunk: int | None = None, weights: Any = None) -> Any:
-    """Brings the cups to a pose, by the joints' limits; the cups are the same after half a turn."""
+    """Brings the cups to a pose, by the joints' limits."""
     from torchdyn_plan.envs.conveyor.panda import PANDA_LINKS
     from torchdyn_plan.planners import IKPlanner, TurnedToGoal
 
     return IKPlanner(
         arm(),
-        approach=TurnedToGoal(symmetry=2),
+        approach=TurnedToGoal(),
         control_step=scene().control_step,
         acceleration=tuple(MARGIN * link.acceleration for link in PANDA_LINKS),
         chunk=chunk,
     )
+
+
+def turn() -> Any:
+    """The cups are turned as the part is, half a turn the same: with the last joint as near to its middle as may be."""
+    from torchdyn_plan.planners import WithTarget
+
+    return WithTarget(symmetry=2, facing=(1.0, 1.0, 0.0))
 
 
 def maneuver() -> Any:
@@ -72,7 +79,7 @@ def maneuver() -> Any:
 
 def dynamic(parts: PlannerParts, forecaster: Any) -> Any:
     """The planner for one part, on that forecast."""
-    from torchdyn_plan.planners import DynamicPlanner, MetWithin, ReplanSchedule, WithTarget
+    from torchdyn_plan.planners import DynamicPlanner, MetWithin, ReplanSchedule
 
     own = maneuver()
     return DynamicPlanner(
@@ -82,7 +89,7 @@ def dynamic(parts: PlannerParts, forecaster: Any) -> Any:
         schedule=ReplanSchedule.every(5),
         maneuver=own,
         lost=MetWithin(low=(0.0, -REACH[0], 0.0), high=(1.0, REACH[1], 1.0)),
-        turn=WithTarget(),
+        turn=turn(),
         chunk=parts.chunk,
         scene=scene().digest(),
     ).eval()
@@ -109,9 +116,9 @@ def first(parts: PlannerParts) -> Any:
 
 def pursuit(parts: PlannerParts) -> Any:
     """Runs after the part that is farthest downstream."""
-    from torchdyn_plan.planners import TargetPursuit, WithTarget
+    from torchdyn_plan.planners import TargetPursuit
 
-    return TargetPursuit(parts.static, turn=WithTarget(), scene=scene().digest()).eval()
+    return TargetPursuit(parts.static, turn=turn(), scene=scene().digest()).eval()
 
 
 def truth(settings: ConveyorSettings, **episodes: Any) -> Truth:
