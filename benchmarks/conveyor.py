@@ -26,8 +26,8 @@ SIDE_BY_SIDE = 100
 class Arguments(Output):
     """Take parts off a belt."""
 
-    planners: tuple[str, ...] = ("pursuit", "meet")
-    """Planners."""
+    planners: tuple[str, ...] = ("pursuit:gain", "pursuit", "meet")
+    """Planners, each behind a colon with its static planner if that is not the task's first."""
     speeds: tuple[float, ...] = (0.2, 0.35, 0.6)
     """Speeds of the belt [m/s]."""
     parts: tuple[int, ...] = (1,)
@@ -47,7 +47,8 @@ def measured(planner: str, speed: float, parts: int, arguments: Arguments) -> Ro
     place, yaw = draw_parts(scene(), torch.arange(arguments.episodes), parts=parts, speed=speed, **series)
     solvable = parts_solvable(scene(), place, yaw, speed=speed)
     env = TASK.make_env(settings, num_envs=min(SIDE_BY_SIDE, arguments.episodes), num_threads=1, **series)
-    acting, taken, steps, row_steps = TASK.planner(planner), [], [], 0
+    name, _, static = planner.partition(":")
+    acting, taken, steps, row_steps = TASK.planner(name, static or None), [], [], 0
     begun = time.perf_counter()
     with torch.no_grad():
         for first in range(0, arguments.episodes, env.num_envs):

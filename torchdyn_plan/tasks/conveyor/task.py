@@ -62,6 +62,13 @@ def ik(*, chunk: int | None = None, weights: Any = None) -> Any:
     )
 
 
+def gain(*, chunk: int | None = None, weights: Any = None) -> Any:
+    """The same by a gain alone, for goals at rest: it lags behind one that moves."""
+    from torchdyn_plan.planners import IKPlanner, TurnedToGoal
+
+    return IKPlanner(arm(), approach=TurnedToGoal(), control_step=scene().control_step, gain=0.1, chunk=chunk)
+
+
 def turn() -> Any:
     """The cups are turned as the part is, half a turn the same: with the last joint as near to its middle as may be."""
     from torchdyn_plan.planners import WithTarget
@@ -145,7 +152,7 @@ TASK = Task(
     control_step=0.02,
     make_env=make_env,
     digest=lambda: scene().digest(),
-    static_planners={"ik": ik},
+    static_planners={"ik": ik, "gain": gain},
     planners={"pursuit": pursuit, "meet": meet, "first": first},
     rivals=("first",),
     rows_at_once=(32, 64),
