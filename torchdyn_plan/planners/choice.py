@@ -87,7 +87,8 @@ class ChoosingPlanner(PretrainedPlanner, Remembering):
         self.of_all = tuple(keys.OF_ALL_TARGETS[key] for key in self.of_one)
         own: list[Any] = [(keys.PLAN, name) for name in NAMES]
         others = [key for key in planner.in_keys if key not in self.of_one]
-        self.in_keys = list(dict.fromkeys([keys.TARGETS_PRESENT, *self.of_all, *others, *own]))
+        read_keys: list[Any] = list(dict.fromkeys([keys.TARGETS_PRESENT, *self.of_all, *others, *own]))
+        self.in_keys = read_keys
         self.out_keys = keys_written(planner, *own)
 
     @property
@@ -141,7 +142,7 @@ class ChoosingPlanner(PretrainedPlanner, Remembering):
 
     def for_inference(self) -> ChoosingPlanner:
         """The same on copies of the planner's networks as they are now, in as few operations as possible."""
-        settings = self.part_settings() | {"planner": self.planner.for_inference()}
+        settings: dict[str, Any] = self.part_settings() | {"planner": self.planner.for_inference()}
         return type(self)(**settings).train(self.training)
 
     def _none(self, like: Tensor) -> Choice:
@@ -159,11 +160,11 @@ class ChoosingPlanner(PretrainedPlanner, Remembering):
             return start, no, no
         fresh = step_count == 0
         choice = Choice(*(where_rows(fresh, *pair) for pair in zip(start, (stored[n] for n in NAMES), strict=True)))
-        maneuver: Any = self.planner.maneuver
-        names = maneuver.State._fields
-        if not isinstance(maneuver, Commits) or any(name not in stored for name in names):
+        kind: Any = self.planner.maneuver.State
+        maneuver = self.planner.maneuver
+        if not isinstance(maneuver, Commits) or any(name not in stored for name in kind._fields):
             return choice, no, no
-        state = maneuver.State(*(stored[name] for name in names))
+        state = kind(*(stored[name] for name in kind._fields))
         return choice, maneuver.finished(state) & ~fresh, maneuver.committed(state) & ~fresh
 
     def _choose(self, tensordict: TensorDictBase, present: Tensor, due: Tensor, chosen: Tensor) -> Tensor:

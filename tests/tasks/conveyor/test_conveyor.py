@@ -68,16 +68,22 @@ def test_a_belt_carries_its_parts_at_its_speed_and_their_future_is_foretold():
     torch.testing.assert_close(seen["targets_quat"][-1], start["targets_quat"], atol=1e-3, rtol=0)
 
 
-def test_no_joint_is_faster_or_quicker_than_it_may_be():
+def test_no_joint_is_told_to_be_faster_or_quicker_than_it_may_be():
     torch.manual_seed(0)
-    env = ConveyorEnv(8, seed=0, num_threads=1)
-    speed = env.rollout(60, break_when_any_done=False)["next", "joint_vel"]
-    limit = torch.tensor([(link.speed, link.acceleration) for link in PANDA_LINKS])
-    change = speed.diff(dim=1).abs() / SCENE.control_step
-    assert (speed.abs() <= 1.03 * limit[:, 0]).all()
-    # Servos are a little soft: what is told keeps to the limits, what is done to some hundredths.
-    assert (change <= 1.15 * limit[:, 1]).all()
-    assert (change.amax((0, 1)) > 0.5 * limit[:, 1]).all()
+    env, told, done = ConveyorEnv(8, seed=0, num_threads=1), [], []
+    td = env.reset()
+    for _ in range(60):
+        td = env.step(td.set("action", torch.rand(8, 7).round() * 2.0 - 1.0))["next"]
+        told.append(env.simulation.told_speed.clone())
+        done.append(td["joint_vel"])
+    told, done = torch.stack(told), torch.stack(done)
+    limit = torch.tensor([(link.speed, link.acceleration) for link in PANDA_LINKS], dtype=torch.float64)
+    assert (told.abs() <= limit[:, 0] + 1e-9).all()
+    quickest = told.diff(dim=0).abs().amax((0, 1)) / SCENE.control_step
+    torch.testing.assert_close(quickest, limit[:, 1])
+    # Servos are a little soft: joints do what they are told but for single steps.
+    assert ((done - told).abs() < 0.1).double().mean() > 0.9
+    assert (done.abs() <= 1.05 * limit[:, 0]).all()
 
 
 def test_an_episode_is_a_function_of_its_number():

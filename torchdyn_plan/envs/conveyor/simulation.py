@@ -19,7 +19,8 @@ class ConveyorSimulation:
 
     ``qpos`` (N, nq) holds MuJoCo's generalised positions, from which a scene can be drawn. ``joint_pos`` and
     ``joint_vel`` (N, 7) [rad, rad/s], ``part_pos``, ``part_quat`` and ``part_vel`` (N, K, …) [m, wxyz, m/s, world; of
-    parts' centres] are views of the simulation: they change with every step, without copies.
+    parts' centres] are views of the simulation: they change with every step, without copies. ``told_speed`` (N, 7) is
+    what the joints' servos were told last, within the limits of speed and acceleration [rad/s].
     """
 
     def __init__(self, num_envs: int, scene: ConveyorScene, *, speed: float, parts: int, num_threads: int = 0) -> None:
@@ -38,7 +39,7 @@ class ConveyorSimulation:
         self.part_pos, self.part_quat = free[..., :3], free[..., 3:]
         self.part_vel, self._part_spin = moving[..., :3], moving[..., 3:]
         self._home = torch.tensor(scene.home, dtype=torch.float64)
-        self._speed = torch.zeros(num_envs, count, dtype=torch.float64)
+        self.told_speed = torch.zeros(num_envs, count, dtype=torch.float64)
         self._fastest, self._quickest, self._low, self._high = torch.tensor(
             [(link.speed, link.acceleration, *link.range) for link in PANDA_LINKS], dtype=torch.float64
         ).unbind(-1)
@@ -46,7 +47,7 @@ class ConveyorSimulation:
     def reset(self, rows: Tensor, place: Tensor, yaw: Tensor) -> None:
         """Put ``rows`` (M,) back: arms at home, parts at ``place`` (M, K, 2) [m], turned by ``yaw`` (M, K) [rad]."""
         self.batch.reset(rows.numpy())
-        self.joint_pos[rows], self._place[rows], self._speed[rows] = self._home, self._home, 0.0
+        self.joint_pos[rows], self._place[rows], self.told_speed[rows] = self._home, self._home, 0.0
         self._ctrl[rows] = 0.0
         self.part_pos[rows, :, :2] = place
         self.part_pos[rows, :, 2] = self.scene.top - 0.5 * self.scene.part_size[2]
@@ -63,8 +64,8 @@ class ConveyorSimulation:
         time = self.scene.control_step
         wanted = wanted.clamp((self._low - self.joint_pos) / time, (self._high - self.joint_pos) / time)
         change = self._quickest * time
-        torch.clamp(wanted, self._speed - change, self._speed + change, out=self._speed)
-        self._ctrl[:] = self._speed.unsqueeze(-1)
+        torch.clamp(wanted, self.told_speed - change, self.told_speed + change, out=self.told_speed)
+        self._ctrl[:] = self.told_speed.unsqueeze(-1)
         self.batch.step(None, nstep=self.substeps)
 
     def hold(self, held: Tensor, tool_pos: Tensor, tool_rotation: Tensor) -> None:

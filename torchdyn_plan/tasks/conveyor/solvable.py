@@ -45,7 +45,7 @@ def parts_solvable(scene: ConveyorScene, place: Tensor, yaw: Tensor, *, speed: f
     belt's speed, is not asked for: so no robot can take more.
     """
     arm = panda_arm(tool_length=scene.tool_length)
-    limits = {
+    limits: dict[str, Any] = {
         "speed": [link.speed for link in PANDA_LINKS],
         "acceleration": [link.acceleration for link in PANDA_LINKS],
     }
