@@ -6,7 +6,7 @@ from torchdyn_plan import keys
 from torchdyn_plan.envs.fetch_reach import keys as fetch_reach_keys
 from torchdyn_plan.envs.trapper import keys as trapper_keys
 
-SYMBOLS = {"D", "N", "A", "H", "F", "S", "M"}
+SYMBOLS = {"D", "N", "A", "H", "F", "S", "M", "K"}
 TABLES = pytest.mark.parametrize("module", [keys, trapper_keys, fetch_reach_keys])
 
 

@@ -5,7 +5,9 @@ import pytest
 from torchdyn_plan.tasks import load_task
 
 
-@pytest.mark.parametrize(("name", "scene"), [("trapper", "ur5"), ("trapper", "paper"), ("chase", None)])
+@pytest.mark.parametrize(
+    ("name", "scene"), [("trapper", "ur5"), ("trapper", "paper"), ("chase", None), ("conveyor", None)]
+)
 def test_steps_are_those_of_the_environment(name, scene):
     task = load_task(name, scene) if scene else load_task(name)
     env = task.make_env(task.default_settings(), num_envs=1, seed=0, split="dev", num_threads=1)

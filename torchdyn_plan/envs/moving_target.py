@@ -82,6 +82,7 @@ class MovingTargetEnv(EnvBase):
         on_bad_action: str = "raise",
         control_step: float | None = None,
         sensor: Sensor | None = None,
+        others: Mapping[str, tuple[tuple[int, ...], torch.dtype]] | None = None,
         device: torch.device | str = "cpu",
     ) -> None:
         """Declare the keys, with nothing started yet.
@@ -107,6 +108,7 @@ class MovingTargetEnv(EnvBase):
             sensor: how the target is measured; exactly for None. With another one `target_pos` is the newest
                 measurement, `target_history` what was shown so at the last control steps, and `measured_pos`,
                 `measured_time` and `true_target_pos` are shown beside. Rewards and flags go by the truth.
+            others: trailing shape and type of each entry that `_others` shows.
             device: where entries are shown and actions are expected; the simulation stays on the CPU.
 
         Raises:
@@ -147,6 +149,7 @@ class MovingTargetEnv(EnvBase):
             flags=self.flags,
             static_target=static_target,
             measurements=0 if self._sensing is None else self._sensing.slots,
+            others=others or {},
         ).to(self.device)
         action = Bounded(-1.0, 1.0, shape=torch.Size((num_envs, action_size)), dtype=torch.float32)
         self.action_spec = action.to(self.device)
@@ -188,6 +191,10 @@ class MovingTargetEnv(EnvBase):
     @abstractmethod
     def _flags(self) -> dict[str, Tensor]:
         """What has happened, bool ``(N,)`` for each of `flags`."""
+
+    def _others(self) -> dict[str, Tensor]:
+        """What a task shows beside, by the keys of its ``others``; tensors that are nowhere else."""
+        return {}
 
     def true_future(self, rows: Tensor, steps: int) -> Tensor:
         """Where the targets of ``rows`` (M,) go from now on if the robots stand still: ``(M, steps, D)`` [m, world].
@@ -405,6 +412,7 @@ class MovingTargetEnv(EnvBase):
         if robot.joint_vel is not None:
             entries[keys.JOINT_VEL] = robot.joint_vel.clone()
         entries |= {key: flag.unsqueeze(-1).clone() for key, flag in self._flags().items()}
+        entries |= self._others()
         if self.static_target:
             entries[keys.GOAL] = target.clone()
         if self._sensing is not None:

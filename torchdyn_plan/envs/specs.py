@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from typing import Any
 
 import torch
@@ -26,6 +27,7 @@ def observation_spec(
     flags: tuple[str, ...],
     static_target: bool,
     measurements: int = 0,
+    others: Mapping[str, tuple[tuple[int, ...], torch.dtype]],
 ) -> Composite:
     """What is observed in ``num_envs`` environments; arguments as of `torchdyn_plan.envs.MovingTargetEnv`.
 
@@ -51,6 +53,9 @@ def observation_spec(
     for key in (keys.HISTORY_LENGTH, keys.EPISODE):
         specs[key] = Unbounded(torch.Size((num_envs,)), dtype=torch.int64)
     specs[keys.STEP_COUNT] = Unbounded(torch.Size((num_envs, 1)), dtype=torch.int64)
+    for key, (shape, dtype) in others.items():
+        size = torch.Size((num_envs, *shape))
+        specs[key] = Binary(shape=size, dtype=dtype) if dtype == torch.bool else Unbounded(size, dtype=dtype)
     for key in flags:
         specs[key] = flag_spec(num_envs)
     return Composite(specs, shape=(num_envs,))

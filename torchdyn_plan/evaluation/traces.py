@@ -60,7 +60,8 @@ class TraceLog:
         else:
             goal, *numbers = map(plan.get, ("goal", "arrival_steps", "replanned", "reachable"))
             numbers = torch.stack(numbers, dim=-1)
-        entries = torch.cat([*_shown(stepped), goal, numbers], dim=-1)
+        # A goal that says how the tool is turned is remembered as the place that it is.
+        entries = torch.cat([*_shown(stepped), goal[..., : tool_pos.shape[-1]], numbers], dim=-1)
         self._record[self._rows, step] = entries.to(self._record.dtype)
 
     def end(self, stepped: TensorDictBase, rows: Tensor) -> None:

@@ -7,6 +7,7 @@ from torchdyn_plan.kinematics.dls import dls_step, limited_step, square_turn, up
 from torchdyn_plan.kinematics.follow import follow
 from torchdyn_plan.kinematics.fused import compiled_pose_and_jacobian
 from torchdyn_plan.kinematics.joint import Coupling, Joint
+from torchdyn_plan.kinematics.quaternions import quat_between, quat_matrix, quat_multiply
 from torchdyn_plan.kinematics.solver import IKResult, IKStatus, solve_ik
 from torchdyn_plan.kinematics.targets import constraint_error, constraint_jacobian, rotation_vector
 from torchdyn_plan.kinematics.ur5 import UR5_LINKS, UR5_SPEED_LIMIT, ur5_urdf
@@ -28,6 +29,9 @@ __all__ = [
     "dls_step",
     "follow",
     "limited_step",
+    "quat_between",
+    "quat_matrix",
+    "quat_multiply",
     "rotation_vector",
     "solve_ik",
     "square_turn",

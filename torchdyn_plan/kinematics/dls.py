@@ -61,6 +61,24 @@ def limited_step(step: Tensor, limit: Tensor, gain: float) -> Tensor:
     return step * torch.clamp(1.0 / worst.clamp_min(1e-12), max=gain)
 
 
+def braked_step(step: Tensor, limit: Tensor, brake: Tensor) -> Tensor:
+    """Shorten ``step`` (*B, N) so that every joint can still stop where the whole of it leads, all in proportion.
+
+    A joint that goes u in a control step and then brakes stops after u + u²/2b, with b what it can change its step by:
+
+        u = -b + √(b² + 2 b e),  which tends to e where that is small.
+
+    Args:
+        step: ``(*B, N)``, the way e that is left.
+        limit: ``(N,)``, the most that a joint moves in a control step.
+        brake: ``(N,)``, the most that this changes by from one step to the next.
+    """
+    way = step.abs()
+    allowed = ((brake.square() + 2.0 * brake * way).sqrt() - brake).minimum(limit)
+    share = (allowed / way.clamp_min(1e-12)).amin(dim=-1, keepdim=True)
+    return step * share.clamp(max=1.0)
+
+
 def dls_step_within(  # noqa: PLR0917  # As of `dls_step`, and the limits.
     jacobian: Tensor,
     error: Tensor,

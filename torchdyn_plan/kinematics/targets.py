@@ -78,7 +78,7 @@ def constraint_error(pose: Tensor, target: Tensor, *, constraint: str = "pose", 
     if constraint == "axis":
         return torch.cat([way, _tilt(turned[..., 2], wanted)], dim=-1)
     if symmetry > 1:
-        wanted = wanted @ _nearest_turn(wanted.mT @ turned, symmetry)
+        wanted = wanted @ nearest_turn(wanted.mT @ turned, symmetry)
     return torch.cat([way, rotation_vector(wanted @ turned.mT)], dim=-1)
 
 
@@ -154,7 +154,7 @@ def _tilt(axis: Tensor, wanted: Tensor) -> Tensor:
     return torch.where(opposite.unsqueeze(-1), half_turn, sine * _angle_over_sine(sine, z.unsqueeze(-1)))
 
 
-def _nearest_turn(relative: Tensor, symmetry: int) -> Tensor:
+def nearest_turn(relative: Tensor, symmetry: int) -> Tensor:
     """The turn about z by a multiple of 2π/symmetry that is nearest to ``relative``, both ``(*B, 3, 3)``."""
     part = 2.0 * math.pi / symmetry
     sine, cosine = relative[..., 1, 0] - relative[..., 0, 1], relative[..., 0, 0] + relative[..., 1, 1]

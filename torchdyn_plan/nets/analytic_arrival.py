@@ -23,7 +23,10 @@ class GoalJoints(Protocol):
     """Tells where the joints are when the tool is at a goal; a `torchdyn_plan.planners.IKPlanner` does."""
 
     def goal_joints(self, joint_pos: Tensor, goal: Tensor, /) -> tuple[Tensor, Tensor]:
-        """Joints ``(*B, N)`` from ``joint_pos`` (*B, N) at ``goal`` (*B, 3) [m, world], and whether it is reached."""
+        """Joints ``(*B, N)`` from ``joint_pos`` (*B, N) at ``goal`` (*B, 3) [m, world], and whether it is reached.
+
+        With a ``goal_size`` of 7 goals are poses, as ``goal_pose`` is.
+        """
         ...
 
 
@@ -104,12 +107,14 @@ class AnalyticArrival(Precise, ArrivalModel):
     def arrival(self, robot_state: Tensor, goal: Tensor, *, estimator: str = "mode") -> Arrival:
         """Arrival ``(*B, K)`` at goals (*B, K, 3) [m, world], by any estimator; never where no joints reach one.
 
+        Where its joints have a ``goal_size`` of 7, goals are poses.
+
         ``robot_state`` (*B, 1, S) begins with the joints' positions and speeds, N of each.
         """
         count = len(self.speed)
         if robot_state.shape[-1] < 2 * count:
             raise InputError(f"robot_state must begin with {2 * count} numbers of joints, got {robot_state.shape[-1]}")
-        check_trailing_shape("goal", goal, 3)
+        check_trailing_shape("goal", goal, getattr(self.joints, "goal_size", 3))
         place = at_least_float32(goal)
         joint_pos, joint_vel = robot_state.to(place.dtype)[..., : 2 * count].split(count, dim=-1)
         there, reached = self.joints.goal_joints(joint_pos, place)

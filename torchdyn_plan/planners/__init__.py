@@ -8,12 +8,13 @@ from torchdyn_plan.planners.baselines import (
     oracle_trajectory,
     wait_at_end,
 )
+from torchdyn_plan.planners.choice import ChoosingPlanner, Commits
 from torchdyn_plan.planners.delivery import Delayed, Delivery
 from torchdyn_plan.planners.maneuver import GoTo, Maneuver
 from torchdyn_plan.planners.match_velocity import MatchPhase, MatchVelocity
 from torchdyn_plan.planners.observation import Observation
 from torchdyn_plan.planners.pace_and_path import PaceAndPath
-from torchdyn_plan.planners.plan import Lost, LostBelow, Plan, PlanStatus
+from torchdyn_plan.planners.plan import Lost, LostBelow, MetWithin, Plan, PlanStatus
 from torchdyn_plan.planners.planner import DynamicPlanner, observe
 from torchdyn_plan.planners.pretrained import shipped_planners
 from torchdyn_plan.planners.protocol import StaticPlanner
@@ -28,7 +29,7 @@ from torchdyn_plan.planners.search import (
     SoftExactSearch,
     search_corners,
 )
-from torchdyn_plan.planners.static.approach import Approach, StraightToGoal
+from torchdyn_plan.planners.static.approach import Approach, StraightToGoal, TurnedToGoal
 from torchdyn_plan.planners.static.callable import CallablePlanner
 from torchdyn_plan.planners.static.ik import IKPlanner
 from torchdyn_plan.planners.static.point import PointPlanner
@@ -36,11 +37,14 @@ from torchdyn_plan.planners.static.policy import PolicyPlanner
 from torchdyn_plan.planners.static.proportional import ProportionalController
 from torchdyn_plan.planners.track import KalmanTrack, LeastSquaresTrack, Track, TrackState
 from torchdyn_plan.planners.tracked import TrackedPlanner
+from torchdyn_plan.planners.turn import Turn, WithTarget
 
 __all__ = [
     "Approach",
     "Background",
     "CallablePlanner",
+    "ChoosingPlanner",
+    "Commits",
     "CornerSearch",
     "Delayed",
     "Delivery",
@@ -59,6 +63,7 @@ __all__ = [
     "MatchPhase",
     "MatchVelocity",
     "Meeting",
+    "MetWithin",
     "Observation",
     "PaceAndPath",
     "Plan",
@@ -78,6 +83,9 @@ __all__ = [
     "Track",
     "TrackState",
     "TrackedPlanner",
+    "Turn",
+    "TurnedToGoal",
+    "WithTarget",
     "measured_latency",
     "observe",
     "oracle_trajectory",

@@ -19,17 +19,25 @@ from torchdyn_plan.planners.planner import DynamicPlanner, are_sane
 from torchdyn_plan.planners.protocol import StaticPlanner, keys_read, keys_written, read
 from torchdyn_plan.planners.search.meeting import NO_CONTEXT, Meeting, SearchContext
 from torchdyn_plan.planners.static.callable import TensorDictFunction
+from torchdyn_plan.planners.turn import Turn
 
 
 class TargetPursuit(Remembering):
     """Runs after the target: at every step the goal is where the target is now (paper, Section IV-A.1)."""
 
-    def __init__(self, static: StaticPlanner, *, scene: str | None = None) -> None:
-        """Run with ``static``, a planner for a static goal; ``scene`` is the digest of its scene, if it has one."""
+    def __init__(self, static: StaticPlanner, *, turn: Turn | None = None, scene: str | None = None) -> None:
+        """Run with ``static``, a planner for a static goal.
+
+        Args:
+            static: as above.
+            turn: how the tool is to be turned, for one that reads ``goal_pose``.
+            scene: digest of its scene; None if it has none.
+        """
         super().__init__()
-        self.static, self.scene = TensorDictFunction.wrap(static), scene
-        self.in_keys = keys_read(self.static, keys.TARGET_POS)
-        self.out_keys = keys_written(self.static, keys.GOAL, keys.ARRIVAL_STEPS)
+        self.static, self.scene, self.turn = TensorDictFunction.wrap(static), scene, turn
+        goals = (keys.GOAL,) if turn is None else (keys.GOAL, keys.GOAL_POSE)
+        self.in_keys = keys_read(self.static, keys.TARGET_POS, *(() if turn is None else turn.in_keys))
+        self.out_keys = keys_written(self.static, *goals, keys.ARRIVAL_STEPS)
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         """Write ``goal`` (*B, D) [m, world] and ``arrival_steps`` (*B,), which is 0, and act.
@@ -42,6 +50,10 @@ class TargetPursuit(Remembering):
         if not are_sane(tensordict, self.in_keys):
             bad = judge_rows(tensordict, self.in_keys, target_pos.shape[:-1])
         tensordict.set(keys.GOAL, target_pos)
+        if self.turn is not None:
+            seen = (read(tensordict, key, "TargetPursuit") for key in self.turn.in_keys)
+            quat = self.turn(target_pos.unsqueeze(-2), target_pos, *seen).squeeze(-2)
+            tensordict.set(keys.GOAL_POSE, torch.cat([target_pos, quat], dim=-1))
         now = torch.zeros(target_pos.shape[:-1], dtype=torch.int64, device=target_pos.device)
         tensordict.set(keys.ARRIVAL_STEPS, now)
         return self.static(tensordict) if bad is None else act(self.static, tensordict, bad)

@@ -13,8 +13,8 @@ from torchdyn_plan import keys
 from torchdyn_plan.checks import POINT_SIZES
 from torchdyn_plan.errors import InputError, TorchdynPlanError
 
-COUNTS = (keys.STEP_COUNT, keys.HISTORY_LENGTH, keys.EPISODE)
-"""Keys that hold whole numbers."""
+COUNTS = (keys.STEP_COUNT, keys.HISTORY_LENGTH, keys.EPISODE, keys.TARGETS_PRESENT)
+"""Keys that hold whole numbers, or whether something is so."""
 
 
 def explain(error: Exception, planner: Any, tensordict: Any) -> InputError | None:

@@ -67,6 +67,9 @@ class MatchVelocity:
     """How far it rises after that, along the axis; as far as it hovers for None [m]."""
     lift_steps: int | None = None
     """Control steps in which it rises and comes to rest; ``descent_steps`` for None."""
+    early_steps: int = 0
+    """It hovers above where the target is so many control steps before the contact, by its `search`: half of those in
+    which it takes on the target's velocity save it from going back and forth."""
     lead_steps: int = 1
     """Control steps that a tool lags behind a goal that moves: goals are so much ahead."""
     along_by: float = 0.7
@@ -83,7 +86,7 @@ class MatchVelocity:
     def __post_init__(self) -> None:
         check_number("hover", self.hover, minimum=0.0)
         check_number("descent_steps", self.descent_steps, minimum=1, integer=True)
-        for name in ("hold_steps", "lead_steps"):
+        for name in ("hold_steps", "early_steps", "lead_steps"):
             check_number(name, getattr(self, name), minimum=0, integer=True)
         if self.lift is not None:
             check_number("lift", self.lift, minimum=0.0)
@@ -113,6 +116,7 @@ class MatchVelocity:
         """
         offset = tuple((self.hover * self._up(torch.zeros(coordinates, dtype=torch.float64))).tolist())
         own: dict[str, Any] = {"stride": 1, "first": 1, "offset": offset, "descent_steps": float(self.descent_steps)}
+        own |= {"early_steps": self.early_steps}
         own |= {"margin": 1.0, "switching_cost": 1.0}
         return ExactSearch(**(own | settings))
 
@@ -133,10 +137,20 @@ class MatchVelocity:
         came = torch.where(rises.unsqueeze(-1), place, came)
         velocity = torch.where(rises.unsqueeze(-1), later - place, state.match_velocity)
         phase = self.phase(step).unsqueeze(-1)
-        goal = torch.where(phase == MatchPhase.DOWN, self._down(step, came, place, up), plan.goal)
+        above, turn = plan.goal.split([tool_pos.shape[-1], plan.goal.shape[-1] - tool_pos.shape[-1]], dim=-1)
+        goal = torch.where(phase == MatchPhase.DOWN, self._down(step, came, place, up), above)
         goal = torch.where(phase == MatchPhase.HOLD, place, goal)
         goal = torch.where(phase == MatchPhase.LIFT, self._lifted(step, came, velocity, up), goal)
-        return goal, MatchState(step, came, velocity)
+        return torch.cat([goal, turn], dim=-1) if turn.shape[-1] else goal, MatchState(step, came, velocity)
+
+    def committed(self, state: MatchState) -> Tensor:
+        """As of `torchdyn_plan.planners.choice.Commits`: from when it comes down until it has risen."""
+        return (state.match_step >= 0) & ~self.finished(state)
+
+    def finished(self, state: MatchState) -> Tensor:
+        """As of `torchdyn_plan.planners.choice.Commits`: it has risen."""
+        steps = self.descent_steps if self.lift_steps is None else self.lift_steps
+        return state.match_step >= self.descent_steps + self.hold_steps + steps
 
     def phase(self, match_step: Tensor) -> Tensor:
         """`MatchPhase` of ``plan.match_step`` (*B,): ``(*B,)`` int64."""

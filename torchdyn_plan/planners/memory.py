@@ -48,12 +48,17 @@ SPARE_STEPS = 8
 class PlannerMemory:
     """The memory of a composed planner: its clock, its plan in use, its maneuver's state, and plans under way."""
 
-    def __init__(self, schedule: Schedule, maneuver: Maneuver, delivery: Delivery | None) -> None:
-        """Lay the memory out for these parts; raises `InputError` where two of them use one name."""
+    def __init__(
+        self, schedule: Schedule, maneuver: Maneuver, delivery: Delivery | None, *, turned: bool = False
+    ) -> None:
+        """Lay the memory out for these parts; raises `InputError` where two of them use one name.
+
+        With ``turned`` goals say how the tool is turned.
+        """
         delay = 0 if delivery is None else delivery.delay
         lookahead = max(maneuver.lookahead, int(schedule.watches))
         self.path_length = lookahead + max(SPARE_STEPS, schedule.longest) + 2 * delay if lookahead else 0
-        hold = partial(Plan.hold, length=self.path_length)
+        hold = partial(Plan.hold, length=self.path_length, turned=turned)
         self.slots = [
             Slot(Clock, Clock._fields, schedule.start, Clock.older),
             Slot(Plan, Plan._fields, hold, Plan.older),

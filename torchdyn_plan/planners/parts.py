@@ -27,8 +27,9 @@ from torchdyn_plan.planners.search.corner import CornerSearch
 from torchdyn_plan.planners.search.exact import ExactSearch
 from torchdyn_plan.planners.search.meeting import GoalSearch
 from torchdyn_plan.planners.static.callable import TensorDictFunction
+from torchdyn_plan.planners.turn import Turn
 
-PARTS = ("static", "forecaster", "eta", "search", "schedule", "maneuver", "delivery", "lost", "chunk", "scene")
+PARTS = ("static", "forecaster", "eta", "search", "schedule", "maneuver", "delivery", "lost", "turn", "chunk", "scene")
 """Arguments of a `ComposedPlanner`, and its attributes."""
 
 
@@ -53,6 +54,7 @@ class ComposedPlanner(PretrainedPlanner, Remembering):
         maneuver: Maneuver | None = None,
         delivery: Delivery | None = None,
         lost: Lost | None = None,
+        turn: Turn | None = None,
         chunk: int | None = None,
         scene: str | None = None,
     ) -> None:
@@ -69,6 +71,8 @@ class ComposedPlanner(PretrainedPlanner, Remembering):
             maneuver: which goal the static planner is sent to at each step; the meeting place by default.
             delivery: how plans come into use late: `Delayed`, or made in the `Background`; at once by default.
             lost: when a target is lost; None if it cannot be.
+            turn: how the tool is to be turned where it meets the target; then ``goal_pose`` is written beside ``goal``,
+                of three coordinates, which ``static`` and ``eta`` are to read. None where places are all.
             chunk: plan in blocks of exactly this many rows, so that results do not depend on the batch size.
             scene: digest of the scene that the planner belongs to; None if it belongs to none.
 
@@ -84,16 +88,25 @@ class ComposedPlanner(PretrainedPlanner, Remembering):
         self.search = ExactSearch(stride=1, first=1) if search is None else search
         self.schedule = ReplanSchedule.every(4) if schedule is None else schedule
         self.maneuver, self.delivery = GoTo() if maneuver is None else maneuver, delivery
-        self.lost, self.chunk, self.scene = lost, chunk, scene
-        self.memory = PlannerMemory(self.schedule, self.maneuver, delivery)
+        self.lost, self.chunk, self.scene, self.turn = lost, chunk, scene, turn
+        if turn is not None and not getattr(self.search, "reads_turn", False):
+            raise InputError(f"{type(self.search).__name__} knows no turn of the tool: search with an ExactSearch")
+        if turn is None and keys.GOAL_POSE in self.static.in_keys:
+            raise InputError(
+                f"{type(static).__name__} reads {keys.GOAL_POSE}: give the planner a turn, as WithTarget()"
+            )
+        self.memory = PlannerMemory(self.schedule, self.maneuver, delivery, turned=turn is not None)
         remembered = [(keys.PLAN, name) for name in self.memory.names]
         reported = [(keys.PLAN, name) for name in REPORTED]
-        self.in_keys = keys_read(self.static, *SEEN_BY_ALL, *self.forecaster.in_keys, *remembered)
+        self.read_by_turn: tuple[Any, ...] = () if turn is None else tuple(turn.in_keys)
+        seen = (*SEEN_BY_ALL, *self.forecaster.in_keys, *self.read_by_turn)
+        self.in_keys = keys_read(self.static, *seen, *remembered)
         shared = [str(key[-1]) for key in (*remembered, *reported) if key in self.static.out_keys]
         if shared:
             raise InputError(f"the static planner and the planner both remember {', '.join(shared)}")
-        self.out_keys = keys_written(self.static, keys.GOAL, keys.ARRIVAL_STEPS, *remembered, *reported)
-        self.read_besides = [key for key in self.in_keys if key not in (*SEEN_BY_ALL, *self.forecaster.in_keys)]
+        goals = (keys.GOAL,) if turn is None else (keys.GOAL, keys.GOAL_POSE)
+        self.out_keys = keys_written(self.static, *goals, keys.ARRIVAL_STEPS, *remembered, *reported)
+        self.read_besides = [key for key in self.in_keys if key not in seen]
         self.read_by_static = [key for key in keys_read(self.static) if key not in SEEN_BY_ALL]
 
     @classmethod
@@ -130,7 +143,8 @@ class ComposedPlanner(PretrainedPlanner, Remembering):
 
     def part_settings(self) -> dict[str, Any]:
         """Arguments that make the same planner."""
-        return {name: getattr(self, name) for name in PARTS}
+        # Planners that are older than the turn keep their description.
+        return {name: getattr(self, name) for name in PARTS if name != "turn" or self.turn is not None}
 
     def train(self, mode: bool = True) -> Self:
         """As of every module, and prepare the models where they are not to be trained."""

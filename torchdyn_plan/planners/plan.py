@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 from torch.func import debug_unwrap
 
-from torchdyn_plan.checks import check_number
+from torchdyn_plan.checks import check_number, check_vector
 from torchdyn_plan.errors import InputError
 from torchdyn_plan.planners.observation import Observation
 from torchdyn_plan.planners.search.meeting import Meeting
@@ -77,6 +77,32 @@ class LostBelow:
         return path[..., 2] <= self.forecast_below
 
 
+@dataclass(frozen=True, kw_only=True)
+class MetWithin:
+    """A target is met within a box alone, as where a robot is quick and clear of its limits; outside it is not lost."""
+
+    low: tuple[float, ...]
+    """Least coordinates of the box, a number for each axis [m, world]."""
+    high: tuple[float, ...]
+    """Greatest coordinates [m, world]."""
+
+    def __post_init__(self) -> None:
+        for name in ("low", "high"):
+            object.__setattr__(self, name, check_vector(name, getattr(self, name)))
+        if len(self.low) != len(self.high) or any(low > high for low, high in zip(self.low, self.high, strict=True)):
+            raise InputError(f"low must be below high along each axis, got {self.low!r} and {self.high!r}")
+
+    def seen(self, target_pos: Tensor) -> Tensor:
+        """As `Lost.seen`: never."""
+        return torch.zeros_like(target_pos[..., 0], dtype=torch.bool)
+
+    def forecast(self, path: Tensor) -> Tensor:
+        """As `Lost.forecast`: outside of the box."""
+        if path.shape[-1] != len(self.low):
+            raise InputError(f"the box has {len(self.low)} axes, but places have {path.shape[-1]} coordinates")
+        return ((path < path.new_tensor(self.low)) | (path > path.new_tensor(self.high))).any(-1)
+
+
 def no_height(place: Tensor) -> InputError:
     """The error about places of other than three coordinates, which have no height."""
     return InputError(f"LostBelow needs points of 3 coordinates, got {place.shape[-1]}: in a plane nothing is below")
@@ -86,7 +112,7 @@ class Plan(NamedTuple):
     """The plan in use in each row."""
 
     goal: Tensor
-    """``(*B, D)`` [m, world]."""
+    """``(*B, D)`` [m, world]; where the planner says how the tool is turned there, its quaternion wxyz follows."""
     arrival_steps: Tensor
     """``(*B,)`` int64 control steps from now to the meeting."""
     clamped: Tensor
@@ -101,12 +127,16 @@ class Plan(NamedTuple):
     """``(*B,)`` int64 control steps since that moment; -1 where no plan was made yet."""
 
     @classmethod
-    def hold(cls, observation: Observation, length: int) -> Plan:
-        """The plan of rows that have none: stay where the tool is, and expect the target to stay where it is."""
+    def hold(cls, observation: Observation, length: int, *, turned: bool = False) -> Plan:
+        """The plan of rows that have none: stay where the tool is, and expect the target to stay where it is.
+
+        With ``turned`` goals are followed by a quaternion: zeros, so that the tool stays turned as it is.
+        """
         tool_pos, target_pos, step = observation.tool_pos, observation.target_pos, observation.step_count
         yes = torch.ones_like(step, dtype=torch.bool)
         at_rest = target_pos.unsqueeze(-2).expand(*target_pos.shape[:-1], length, target_pos.shape[-1])
-        return cls(tool_pos, torch.zeros_like(step), ~yes, yes, yes, at_rest, torch.full_like(step, -1))
+        goal = torch.nn.functional.pad(tool_pos, (0, 4)) if turned else tool_pos
+        return cls(goal, torch.zeros_like(step), ~yes, yes, yes, at_rest, torch.full_like(step, -1))
 
     @classmethod
     def make(cls, meeting: Meeting, usable: Tensor, target_pos: Tensor, path: Tensor, length: int) -> Plan:
@@ -133,8 +163,11 @@ class Plan(NamedTuple):
         """The plan, but ``rows`` (*B,) bool stay where their tool is, (*B, D) [m, world]."""
         if not (torch.compiler.is_compiling() or debug_unwrap(rows).any()):
             return self
+        stay = tool_pos
+        if self.goal.shape != tool_pos.shape:
+            stay = torch.nn.functional.pad(tool_pos, (0, self.goal.shape[-1] - tool_pos.shape[-1]))
         return self._replace(
-            goal=torch.where(rows.unsqueeze(-1), tool_pos, self.goal),
+            goal=torch.where(rows.unsqueeze(-1), stay, self.goal),
             arrival_steps=self.arrival_steps.masked_fill(rows, 0),
             clamped=self.clamped & ~rows,
             reachable=self.reachable & ~rows,

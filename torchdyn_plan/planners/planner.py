@@ -37,7 +37,7 @@ class DynamicPlanner(ComposedPlanner):
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         """Plan where a plan is due, and act; raises `InputError` for a missing key or a wrong shape."""
-        seen = observe(tensordict, self.forecaster)
+        seen = observe(tensordict, self.forecaster, self.read_by_turn)
         obs, found = seen, GOOD
         if not are_sane(tensordict, self.read_besides, *seen[:3], *seen.seen):
             obs, found = judge(seen, tensordict, self.read_by_static, self.memory.names)
@@ -65,6 +65,9 @@ class DynamicPlanner(ComposedPlanner):
         goal, state = self.maneuver(plan, obs, holds, state)
         status = plan.status(trouble, ticked.replans)
         self.memory.remember(tensordict, (ticked, plan, state, pending), replanned=planned, status=status)
+        if self.turn is not None:
+            tensordict.set(keys.GOAL_POSE, goal)
+            goal = goal[..., :3]
         tensordict.set(keys.GOAL, goal)
         tensordict.set(keys.ARRIVAL_STEPS, plan.arrival_steps)
         return self.static(tensordict) if found.blind is None else act(self.static, tensordict, found.blind)
@@ -75,25 +78,29 @@ class DynamicPlanner(ComposedPlanner):
         forecaster, eta_model = self.forecaster, self.eta
         if self.prepared is not None and self.prepared.stands_for(observation.robot_state, *observation.seen):
             forecaster, eta_model = self.prepared.copies
-        forecast = forecaster.predict(*observation.seen)
+        count = len(self.forecaster.in_keys)
+        forecast = forecaster.predict(*observation.seen[:count])
         path, usable = usable_path(forecast.path, observation.target_pos)
+        turn = None if self.turn is None else self.turn(path, observation.target_pos, *observation.seen[count:])
         forecast, target_pos = Forecast(path, forecast.spread), observation.target_pos
         eta, planned_steps = eta_model.from_state(observation.robot_state), plan.arrival_steps
         if delay:
             # From here on all is counted from when the plan comes into use.
             forecast, eta = forecast.after(delay), later(eta, delay)
             target_pos, planned_steps = path[..., delay - 1, :], (planned_steps - delay).clamp_min(0)
-        context = SearchContext(observation.tool_pos, planned_steps, self.lost)
+            turn = None if turn is None else turn[..., delay:, :]
+        context = SearchContext(observation.tool_pos, planned_steps, self.lost, turn)
         meeting = self.search(forecast, target_pos, eta, context)
         return Plan.make(meeting, usable, target_pos, forecast.path, self.memory.path_length)
 
 
-def observe(tensordict: TensorDictBase, forecaster: ForecastModel) -> Observation:
+def observe(tensordict: TensorDictBase, forecaster: ForecastModel, besides: Sequence[Any] = ()) -> Observation:
     """What a planner with this ``forecaster`` sees; raises `InputError` for a missing key or a wrong shape.
 
+    Entries ``besides`` are seen, too, after those that the forecaster reads.
     Half precision becomes float32, and a step count of any type int64.
     """
-    wanted = (*SEEN_BY_ALL, *forecaster.in_keys)
+    wanted = (*SEEN_BY_ALL, *forecaster.in_keys, *besides)
     values = [tensordict.get(key, None) for key in wanted]
     if any(value is None for value in values):
         values = [read(tensordict, key, "DynamicPlanner") for key in wanted]

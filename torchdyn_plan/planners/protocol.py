@@ -35,7 +35,7 @@ def read(tensordict: TensorDictBase, key: NestedKey, reader: str) -> Tensor:
 
 def keys_read(static: TensorDictModuleBase, *others: NestedKey) -> list[Any]:
     """Keys that a planner built on ``static`` reads: ``others`` and those of ``static`` but the goal, each once."""
-    return list(dict.fromkeys([*others, *(key for key in static.in_keys if key != keys.GOAL)]))
+    return list(dict.fromkeys([*others, *(key for key in static.in_keys if key not in (keys.GOAL, keys.GOAL_POSE))]))
 
 
 def keys_written(static: TensorDictModuleBase, *others: NestedKey) -> list[Any]:

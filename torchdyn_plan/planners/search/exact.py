@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, NamedTuple
+from typing import TYPE_CHECKING, ClassVar, NamedTuple
 
 import torch
 from torch import Tensor
@@ -65,6 +65,8 @@ class ExactSearch:
     then, by the spread of the forecast.
     """
 
+    reads_turn: ClassVar[bool] = True
+
     stride: int = 5
     """Control steps between candidates; an arrival bin's width loses nothing."""
     first: int = 2
@@ -75,6 +77,8 @@ class ExactSearch:
     """Goals are clamped to the square of this half-side, where the tool can be; None to leave them [m]."""
     offset: tuple[float, ...] | None = None
     """From the target to the goal, where the tool waits, a number for each axis [m]; None for no way at all."""
+    early_steps: int = 0
+    """The goal is where the target is so many control steps before they meet: from there the tool goes along."""
     descent_steps: float = 0.0
     """Control steps that the robot needs from the goal to the target."""
     margin: float = 0.0
@@ -110,7 +114,8 @@ class ExactSearch:
     def __post_init__(self) -> None:
         for name in ("stride", "coarse", "longest_dwell"):
             check_number(name, getattr(self, name), minimum=1, integer=True)
-        check_number("first", self.first, minimum=0, integer=True)
+        for name in ("first", "early_steps"):
+            check_number(name, getattr(self, name), minimum=0, integer=True)
         check_number("axis_edge", self.axis_edge, minimum=1e-9)
         for name in (
             "descent_steps",
@@ -158,6 +163,9 @@ class ExactSearch:
         """
         check_context(forecast.path, target_pos, context)
         candidates = self.candidates(forecast.path, target_pos, context.lost)
+        if context.turn is not None:
+            turns = context.turn[..., (candidates.steps - 1).clamp_min(0), :]
+            candidates = candidates._replace(goals=torch.cat([candidates.goals, turns], dim=-1))
         kept = None
         if context.planned_steps is not None:
             # Nearer in time to the meeting planned before than any other candidate, or as near: the same meeting.
@@ -175,7 +183,7 @@ class ExactSearch:
             probability = None
             if self.probability_weight > 0.0:
                 time = candidates.target_steps - self.descent_steps
-                offset = (candidates.goals - candidates.places)[..., :2]
+                offset = candidates.goals[..., :2] - candidates.places[..., :2]
                 spread = None if forecast.spread is None else forecast.spread.at(candidates.steps)
                 probability = meeting_probability(arrival, eta_steps, time, spread, offset, half_width=self.footprint)
             best, reachable = self._choose(candidates, kept, eta_steps, probability)
@@ -193,7 +201,7 @@ class ExactSearch:
         eta_steps = arrival.steps.masked_fill(arrival.never, torch.inf)
         if tool_pos is None or self.arrival_radius == 0.0:
             return eta_steps, arrival
-        away = (goals - tool_pos.unsqueeze(-2))[..., :2].square().sum(-1)
+        away = (goals[..., :2] - tool_pos.unsqueeze(-2)[..., :2]).square().sum(-1)
         return eta_steps.masked_fill(away < self.arrival_radius**2, 0.0), arrival
 
     def _choose(
@@ -225,7 +233,8 @@ class ExactSearch:
         first = min(self.first, path.shape[-2])
         steps = torch.arange(first, whole.shape[-2], self.stride, device=path.device)
         places = whole[..., first :: self.stride, :]
-        goals, gone = self.goals(places), None if lost is None else lost.forecast(whole)
+        waited = places if self.early_steps == 0 else whole[..., (steps - self.early_steps).clamp_min(0), :]
+        goals, gone = self.goals(waited), None if lost is None else lost.forecast(whole)
         cost = self.waiting_cost * steps
         if self.base_pos is not None:
             x, y = self.base_pos

@@ -17,7 +17,7 @@ class Meeting(NamedTuple):
     """Where and when robot and target meet."""
 
     goal: Tensor
-    """``(*B, D)`` [m, world]: where they meet."""
+    """``(*B, D)`` [m, world]: where they meet; with a turn in the context the tool's quaternion follows."""
     arrival_steps: Tensor
     """``(*B,)`` int64: control steps from now to the meeting, at most the horizon."""
     clamped: Tensor
@@ -35,13 +35,18 @@ class SearchContext(NamedTuple):
     """``(*B,)`` control steps from now to the meeting that was planned before."""
     lost: Lost | None = None
     """When a target is lost."""
+    turn: Tensor | None = None
+    """``(*B, F, 4)``: how a tool that meets the target on its forecast is to be turned, quaternions wxyz."""
 
 
 NO_CONTEXT = SearchContext()
 
 
 class GoalSearch(Protocol):
-    """A strategy that chooses where and when robot and target meet."""
+    """A strategy that chooses where and when robot and target meet.
+
+    One that reads how the tool is to be turned says so by ``reads_turn``.
+    """
 
     def __call__(
         self, forecast: Forecast, target_pos: Tensor, eta: ArrivalQuery, context: SearchContext = NO_CONTEXT, /

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import functools
 import math
+from collections.abc import Sequence
 from typing import Any, NamedTuple, cast
 
 import torch
@@ -17,12 +18,12 @@ from torchdyn_plan.errors import InputError
 from torchdyn_plan.kinematics.arm import Arm
 from torchdyn_plan.kinematics.components import Vector, damped_least_squares
 from torchdyn_plan.kinematics.descent import evaluate
-from torchdyn_plan.kinematics.dls import dls_step, limited_step
+from torchdyn_plan.kinematics.dls import braked_step, dls_step, limited_step
 from torchdyn_plan.kinematics.fused import Columns, Fused, filled
 from torchdyn_plan.nets.analytic_arrival import AnalyticArrival
 from torchdyn_plan.planners.memory import remember, warn_of_loss
 from torchdyn_plan.planners.protocol import read
-from torchdyn_plan.planners.static.approach import Approach, StraightToGoal
+from torchdyn_plan.planners.static.approach import Approach, StraightToGoal, reads_pose
 from torchdyn_plan.planners.static.base import StaticPlannerModule
 from torchdyn_plan.precision import Precise
 
@@ -35,7 +36,7 @@ class Path(NamedTuple):
     step: Tensor
     """``(*B,)`` int64 steps of it that are made."""
     goal: Tensor
-    """``(*B, 3)`` where it leads [m, world]."""
+    """``(*B, 3)`` where it leads [m, world]; of a planner of poses ``(*B, 7)``."""
 
 
 PASSES = 2
@@ -46,6 +47,10 @@ GOAL_DAMPING = 0.005
 """λ of these steps."""
 GOAL_TOLERANCE = 0.015
 """A tool within this of its goal is there [m]."""
+TURN_TOLERANCE = 0.05
+"""The same of how it is turned [rad]."""
+GOAL_SPEED = 2.0
+"""A goal that is another one than a step before, nearer than this speed explains, moves; else it is a new one [m/s]."""
 PATH_NAMES = tuple(f"path_{field}" for field in Path._fields)
 
 
@@ -56,10 +61,14 @@ class IKPlanner(Precise, StaticPlannerModule):
     and its memory under ``plan``. The arm follows a path of `PATH_LENGTH` steps from where it was when the path began,
     whatever it does meanwhile; the path is flushed when the goal changes (paper, Section III-B.1), and rows with
     ``step_count`` 0 start afresh. A control step solves that step of the path alone: a flushed path costs nothing.
+
+    With an approach that turns the tool, `TurnedToGoal`, it reads ``goal_pose`` (*B, 7) in place of ``goal``, and so do
+    its methods.
     """
 
     PATH_LENGTH = 5
     _limit: Tensor
+    _brake: Tensor
 
     def __init__(
         self,
@@ -69,6 +78,7 @@ class IKPlanner(Precise, StaticPlannerModule):
         control_step: float = 0.004,
         damping: float = 0.02,
         gain: float = 0.25,
+        acceleration: float | Sequence[float] | None = None,
         chunk: int | None = None,
         compiled: bool = False,
     ) -> None:
@@ -80,6 +90,8 @@ class IKPlanner(Precise, StaticPlannerModule):
             control_step: time between two actions [s].
             damping: λ of the least squares.
             gain: share of the remaining joint error that one step may cover, which brakes the arm at the end.
+            acceleration: limit of each joint, or of all of them [rad/s²]: the arm brakes by it and not by ``gain``, and
+                goes along with a goal that moves, a control step behind it. None for the gain alone.
             chunk: solve in blocks of exactly this many rows, so that results do not depend on the batch size.
             compiled: solve in one compiled loop, which takes a C++ compiler and some seconds at the first call (less
                 where torch finds it in its cache); actions are the same but for rounding, do not depend on the batch
@@ -90,14 +102,20 @@ class IKPlanner(Precise, StaticPlannerModule):
             raise InputError(f"arm must be an Arm, as from Arm.from_urdf or Arm.ur5, got {type(arm).__name__}")
         if chunk is not None:
             check_number("chunk", chunk, minimum=1, integer=True)
-        remembered: list[Any] = [(keys.PLAN, name) for name in PATH_NAMES]
-        self.in_keys = [keys.JOINT_POS, keys.GOAL, keys.STEP_COUNT, *remembered]
-        self.out_keys = [keys.ACTION, *remembered]
         self.arm, self.approach = arm, approach or StraightToGoal()
+        turns = reads_pose(self.approach)
+        self.goal_key, self.goal_size = (keys.GOAL_POSE, 7) if turns else (keys.GOAL, 3)
+        if compiled and (turns or acceleration is not None):
+            raise InputError("a compiled IKPlanner takes neither poses nor an acceleration: leave compiled=False")
+        remembered: list[Any] = [(keys.PLAN, name) for name in PATH_NAMES]
+        self.in_keys = [keys.JOINT_POS, self.goal_key, keys.STEP_COUNT, *remembered]
+        self.out_keys = [keys.ACTION, *remembered]
         self.control_step, self.damping, self.gain, self.chunk = control_step, damping, gain, chunk
         self.compiled = compiled
         self._fused = Fused(self._fused_step) if compiled else None
         self.register_buffer("_limit", arm.needed_speed_limit("IKPlanner") * control_step, False)
+        self.acceleration = acceleration
+        self.register_buffer("_brake", None if acceleration is None else self._brake_of(acceleration), False)
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         """Write ``action`` for the ``goal`` in ``tensordict``, on a new path where the old one is used up or stale.
@@ -105,18 +123,19 @@ class IKPlanner(Precise, StaticPlannerModule):
         Raises:
             InputError: a key is missing, a shape is wrong, or the goal holds a NaN or an infinity.
         """
-        wanted = keys.JOINT_POS, keys.GOAL, keys.STEP_COUNT
+        wanted = keys.JOINT_POS, self.goal_key, keys.STEP_COUNT
         values: list[Any] = [tensordict.get(key, None) for key in wanted]
         if any(value is None for value in values):
             values = [read(tensordict, key, "IKPlanner") for key in wanted]
         joint_pos, goal, step_count = values
         if not torch.compiler.is_compiling():
-            fits = joint_pos.shape[-1:] == self._limit.shape and goal.shape == (*joint_pos.shape[:-1], 3)
+            fits = joint_pos.shape[-1:] == self._limit.shape and goal.shape == (*joint_pos.shape[:-1], self.goal_size)
             if not (fits and math.isfinite(debug_unwrap(goal).sum().item())):
                 self._check(joint_pos, goal)
-        path_pos, path_step = self._recall(tensordict.get(keys.PLAN, None), joint_pos, goal, step_count)
+        path_pos, path_step, before = self._recall(tensordict.get(keys.PLAN, None), joint_pos, goal, step_count)
+        goals = (goal,) if self.acceleration is None else (goal, before)
         blocks = self.chunk is not None and self._fused is None
-        action, path_pos = self._step_blocks(path_pos, goal) if blocks else self.step(path_pos, goal)
+        action, path_pos = self._step_blocks(path_pos, *goals) if blocks else self.step(path_pos, *goals)
         tensordict.set(keys.ACTION, action.to(joint_pos.dtype))
         path = Path(path_pos.to(joint_pos.dtype), path_step + 1, goal)
         remember(tensordict, dict(zip(PATH_NAMES, path, strict=True)))
@@ -126,48 +145,68 @@ class IKPlanner(Precise, StaticPlannerModule):
         """The entries of a path that is used up, as `Remembering` says."""
         batch = like.shape[:-1]
         step = torch.full(batch, self.PATH_LENGTH, dtype=torch.int64, device=like.device)
-        path = Path(like.new_zeros(*batch, self.arm.num_joints), step, torch.zeros_like(like))
+        path = Path(like.new_zeros(*batch, self.arm.num_joints), step, like.new_zeros(*batch, self.goal_size))
         return dict(zip(PATH_NAMES, path, strict=True))
 
     def arrival_model(self) -> AnalyticArrival:
         """When its joints are at a goal: ``robot_state`` is to begin with the joints' positions and speeds.
 
-        It takes them for as quick to speed up as the planner is to brake, within ``1 / gain`` control steps; a robot
-        that lags, or is told its limits, has an `AnalyticArrival` of its own.
+        It takes them for as quick to speed up as the planner is to brake, by its acceleration, or within ``1 / gain``
+        control steps; a robot that lags, or is told its limits, has an `AnalyticArrival` of its own.
         """
         speed = self._limit / self.control_step
-        acceleration = speed * (self.gain / self.control_step)
+        if self.acceleration is None:
+            acceleration = speed * (self.gain / self.control_step)
+        else:
+            acceleration = self._brake / self.control_step**2
         return AnalyticArrival(self, speed=speed, acceleration=acceleration, control_step=self.control_step)
 
     def part_settings(self) -> dict[str, Any]:
         """Arguments that make the same planner."""
         names = ("arm", "approach", "control_step", "damping", "gain", "chunk", "compiled")
-        return {name: getattr(self, name) for name in names}
+        # Planners that are older than the acceleration keep their description.
+        others = () if self.acceleration is None else ("acceleration",)
+        return {name: getattr(self, name) for name in (*names, *others)}
 
-    def _recall(self, plan: Any, joint_pos: Tensor, goal: Tensor, step_count: Tensor) -> tuple[Tensor, Tensor]:
-        """Where the path stands, (*B, N) and its step (*B,); where ``plan`` holds none to follow, a new path begins."""
+    def _brake_of(self, acceleration: float | Sequence[float]) -> Tensor:
+        """The most that each joint's step changes by from one control step to the next, ``(N,)`` [rad]."""
+        count = self.arm.num_joints
+        values = [acceleration] * count if isinstance(acceleration, (int, float)) else list(acceleration)
+        if len(values) != count:
+            raise InputError(f"acceleration must be one number or {count}, one for each joint, got {len(values)}")
+        for value in values:
+            check_number("acceleration", value, minimum=1e-6)
+        return self._limit.new_tensor(values) * self.control_step**2
+
+    def _recall(self, plan: Any, joint_pos: Tensor, goal: Tensor, step_count: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        """Where the path stands, (*B, N), its step (*B,), and the goal of the step before, or that of now.
+
+        Where ``plan`` holds none to follow, a new path begins.
+        """
         stored: dict[str, Any] = {} if plan is None else dict(plan.items())
         if any(name not in stored for name in PATH_NAMES):
             warn_of_loss(PATH_NAMES[0], step_count == 0)
-            return joint_pos, torch.zeros(joint_pos.shape[:-1], dtype=torch.int64, device=joint_pos.device)
+            return joint_pos, torch.zeros(joint_pos.shape[:-1], dtype=torch.int64, device=joint_pos.device), goal
         path = Path(*(stored[name] for name in PATH_NAMES))
         ends = (path.step >= self.PATH_LENGTH) | (path.goal != goal).any(-1)
-        ends |= step_count.reshape(ends.shape) == 0
-        return torch.where(ends.unsqueeze(-1), joint_pos, path.pos), path.step.masked_fill(ends, 0)
+        fresh = step_count.reshape(ends.shape) == 0
+        ends |= fresh
+        before = path.goal if self.acceleration is None else torch.where(fresh.unsqueeze(-1), goal, path.goal)
+        return torch.where(ends.unsqueeze(-1), joint_pos, path.pos), path.step.masked_fill(ends, 0), before
 
-    def _step_blocks(self, joint_pos: Tensor, goal: Tensor) -> tuple[Tensor, Tensor]:
+    def _step_blocks(self, joint_pos: Tensor, *goals: Tensor) -> tuple[Tensor, Tensor]:
         """`step`, in blocks of ``chunk`` rows, of which the last is filled up."""
         assert self.chunk is not None
         batch, padding = joint_pos.shape, (0, 0, 0, -joint_pos.shape[:-1].numel() % self.chunk)
-        rows = [nn.functional.pad(value.reshape(-1, value.shape[-1]), padding) for value in (joint_pos, goal)]
+        rows = [nn.functional.pad(value.reshape(-1, value.shape[-1]), padding) for value in (joint_pos, *goals)]
         action, reached = self.step(*rows)
         count = batch[:-1].numel()
         return action[:count].reshape(batch), reached[:count].reshape(batch)
 
     def _check(self, joint_pos: Tensor, goal: Tensor) -> None:
         check_trailing_shape(keys.JOINT_POS, joint_pos, self.arm.num_joints)
-        check_trailing_shape(keys.GOAL, goal, *joint_pos.shape[:-1], 3)
-        check_finite(keys.GOAL, goal)
+        check_trailing_shape(self.goal_key, goal, *joint_pos.shape[:-1], self.goal_size)
+        check_finite(self.goal_key, goal)
 
     def path(self, joint_pos: Tensor, goal: Tensor) -> Tensor:
         """Next `PATH_LENGTH` actions from ``joint_pos`` (*B, N) towards ``goal`` (*B, 3) [m, world]: (*B, 5, N)."""
@@ -187,7 +226,7 @@ class IKPlanner(Precise, StaticPlannerModule):
         """
         goal = goal.to(self._limit.dtype)
         q = joint_pos.to(goal.dtype).expand(*goal.shape[:-1], joint_pos.shape[-1])
-        batch, goal = goal.shape[:-1], goal.reshape(-1, 3)
+        batch, goal = goal.shape[:-1], goal.reshape(-1, goal.shape[-1])
         q = q.reshape(-1, q.shape[-1])
         longest = torch.full_like(self._limit, GOAL_STEP)
         for _ in range(GOAL_STEPS):
@@ -195,17 +234,22 @@ class IKPlanner(Precise, StaticPlannerModule):
             error = self._way(pose, goal)
             step = limited_step(dls_step(jacobian[..., : error.shape[-1], :], error, GOAL_DAMPING), longest, 1.0)
             q = torch.clamp(q + step, self.arm.lower, self.arm.upper)
-        left = self._way(self.arm(q), goal)[..., :3].norm(dim=-1)
+        way = self._way(self.arm(q), goal)
+        left = way[..., :3].norm(dim=-1)
         outside = (self.approach.within_reach(goal) - goal).norm(dim=-1)
         reached = (left <= GOAL_TOLERANCE) & (outside <= GOAL_TOLERANCE)
+        if self.goal_size == 7:
+            reached = reached & (way[..., 3:].norm(dim=-1) <= TURN_TOLERANCE)
         return q.view(*batch, -1), reached.view(batch)
 
     def _way(self, pose: Tensor, goal: Tensor) -> Tensor:
-        """The twist still to go from poses (R, 4, 4) to goals (R, 3)."""
+        """The twist still to go from poses (R, 4, 4) to goals (R, 3 or 7)."""
         return torch.stack(self.approach.twist(pose[..., :3, :].flatten(-2).unbind(-1), goal.unbind(-1)), dim=-1)
 
-    def step(self, joint_pos: Tensor, goal: Tensor) -> tuple[Tensor, Tensor]:
+    def step(self, joint_pos: Tensor, goal: Tensor, before: Tensor | None = None) -> tuple[Tensor, Tensor]:
         """One step of the path from ``joint_pos`` (*B, N) [rad] towards ``goal`` (*B, 3) [m, world].
+
+        With an acceleration, ``before`` (*B, 3) is the goal of the step before: the step goes along with its motion.
 
         Returns:
             The action ``(*B, N)`` and the joint angles to which the path has come ``(*B, N)`` [rad].
@@ -221,7 +265,29 @@ class IKPlanner(Precise, StaticPlannerModule):
             pose, jacobian = self.arm.form.pose_and_jacobian(joint_pos)
         else:
             pose, jacobian = self._pose_and_jacobian(joint_pos)
+        if self.acceleration is not None:
+            return self._step_braked(joint_pos, goal, goal if before is None else before, pose, jacobian)
         return self._step_from(joint_pos, goal, pose, jacobian)
+
+    def _step_braked(
+        self, joint_pos: Tensor, goal: Tensor, before: Tensor, pose: Tensor, jacobian: Tensor
+    ) -> tuple[Tensor, Tensor]:
+        """`step` by the acceleration: the way to the last goal is braked, and what it moved since then is added."""
+        error, old = self._way(pose, goal), self._way(pose, before.to(goal.dtype))
+        moved = error - old
+        moves = moved[..., :3].norm(dim=-1, keepdim=True) <= GOAL_SPEED * self.control_step
+        along = torch.where(moves, moved, 0.0)
+        low, high = self.arm.lower - joint_pos, self.arm.upper - joint_pos
+        rows = jacobian[..., : error.shape[-1], :]
+        ways = [self._within(dls_step(rows, way, self.damping), rows, way, low, high) for way in (error - along, along)]
+        step = limited_step(braked_step(ways[0], self._limit, self._brake) + ways[1], self._limit, 1.0)
+        step = torch.clamp(step, low, high)
+        return (step / self._limit).clamp(-1.0, 1.0), joint_pos + step
+
+    def _within(self, whole: Tensor, rows: Tensor, error: Tensor, low: Tensor, high: Tensor) -> Tensor:
+        """``whole``, or where it pushes a joint out of its limits what the others make of it."""
+        pushes = ((low >= 0.0) & (whole < 0.0)) | ((high <= 0.0) & (whole > 0.0))
+        return self._without_held(whole, rows, error, low, high) if bool(pushes.any()) else whole
 
     def _step_from(self, joint_pos: Tensor, goal: Tensor, pose: Tensor, jacobian: Tensor) -> tuple[Tensor, Tensor]:
         """`step` where the tool's pose and Jacobian are known."""

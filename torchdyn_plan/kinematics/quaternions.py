@@ -1,0 +1,75 @@
+"""Unit quaternions wxyz, as tensors ``(*B, 4)``: rotations in four numbers."""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor
+
+SHORTEST = 1e-6
+"""A quaternion shorter than this says nothing of a rotation."""
+
+
+def quat_multiply(first: Tensor, second: Tensor) -> Tensor:
+    """The rotation ``second`` and then ``first``, quaternions ``(*B, 4)`` each: as R₁R₂ of matrices."""
+    first, second = torch.broadcast_tensors(first, second)
+    w, v = first[..., :1], first[..., 1:]
+    u, x = second[..., :1], second[..., 1:]
+    scalar = w * u - (v * x).sum(-1, keepdim=True)
+    return torch.cat([scalar, w * x + u * v + torch.linalg.cross(v, x)], dim=-1)
+
+
+def quat_matrix(quat: Tensor) -> Tensor:
+    """Rotation matrices ``(*B, 3, 3)`` of quaternions ``(*B, 4)`` of any length; of zeros no rotation."""
+    square = quat.square().sum(-1, keepdim=True)
+    known = square > SHORTEST**2
+    quat = torch.where(known, quat, quat.new_tensor([1.0, 0.0, 0.0, 0.0]))
+    w, x, y, z = (quat / torch.where(known, square, 1.0).sqrt()).unbind(-1)
+    rows = [
+        [1.0 - 2.0 * (y * y + z * z), 2.0 * (x * y - w * z), 2.0 * (x * z + w * y)],
+        [2.0 * (x * y + w * z), 1.0 - 2.0 * (x * x + z * z), 2.0 * (y * z - w * x)],
+        [2.0 * (x * z - w * y), 2.0 * (y * z + w * x), 1.0 - 2.0 * (x * x + y * y)],
+    ]
+    return torch.stack([torch.stack(row, dim=-1) for row in rows], dim=-2)
+
+
+def quat_between(start: Tensor, end: Tensor) -> Tensor:
+    """The least turn that brings directions ``start`` (*B, 3) to ``end`` (*B, 3), of any length: ``(*B, 4)``.
+
+    Of opposite directions it is half a turn.
+    """
+    start, end = (torch.nn.functional.normalize(value, dim=-1) for value in torch.broadcast_tensors(start, end))
+    scalar = 1.0 + (start * end).sum(-1, keepdim=True)
+    # Opposite directions: about any axis across them, here one that is not along the largest of their entries.
+    smallest = torch.nn.functional.one_hot(start.abs().argmin(-1), 3).to(start.dtype)
+    across = torch.linalg.cross(start, smallest)
+    opposite = scalar < SHORTEST
+    quat = torch.where(
+        opposite, torch.nn.functional.pad(across, (1, 0)), torch.cat([scalar, torch.linalg.cross(start, end)], -1)
+    )
+    return torch.nn.functional.normalize(quat, dim=-1)
+
+
+def is_turned(quat: Tensor) -> Tensor:
+    """Whether quaternions ``(*B, 4)`` say how something is turned, ``(*B,)`` bool: zeros do not."""
+    return quat.square().sum(-1) > SHORTEST**2
+
+
+def matrix_quat(rotation: Tensor) -> Tensor:
+    """Unit quaternions ``(*B, 4)`` of rotation matrices ``(*B, 3, 3)``, by the surest of the four ways to read one."""
+    # Every row of this matrix is the quaternion, times four of its entries.
+    r = rotation
+    x, y, z = r.diagonal(dim1=-2, dim2=-1).unbind(-1)
+    skew = [r[..., 2, 1] - r[..., 1, 2], r[..., 0, 2] - r[..., 2, 0], r[..., 1, 0] - r[..., 0, 1]]
+    xy, xz, yz = r[..., 0, 1] + r[..., 1, 0], r[..., 0, 2] + r[..., 2, 0], r[..., 1, 2] + r[..., 2, 1]
+    rows = torch.stack(
+        [
+            torch.stack([1.0 + x + y + z, *skew], dim=-1),
+            torch.stack([skew[0], 1.0 + x - y - z, xy, xz], dim=-1),
+            torch.stack([skew[1], xy, 1.0 - x + y - z, yz], dim=-1),
+            torch.stack([skew[2], xz, yz, 1.0 - x - y + z], dim=-1),
+        ],
+        dim=-2,
+    )
+    largest = rows.diagonal(dim1=-2, dim2=-1).argmax(-1)
+    best = rows.gather(-2, largest[..., None, None].expand(*largest.shape, 1, 4)).squeeze(-2)
+    return torch.nn.functional.normalize(best, dim=-1)

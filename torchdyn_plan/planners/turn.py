@@ -1,0 +1,81 @@
+"""How a tool is to be turned where it meets its target: a part of planners whose goals are poses."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any, ClassVar, Protocol
+
+import torch
+from torch import Tensor
+
+from torchdyn_plan import keys
+from torchdyn_plan.checks import check_number, check_trailing_shape, check_vector
+from torchdyn_plan.errors import InputError
+from torchdyn_plan.kinematics.quaternions import quat_matrix, quat_multiply
+
+
+class Turn(Protocol):
+    """Says how the tool is to be turned at each place of a forecast."""
+
+    @property
+    def in_keys(self) -> Sequence[Any]:
+        """Entries that it reads of the observation, beside where the target is."""
+        ...
+
+    def __call__(self, path: Tensor, target_pos: Tensor, /, *seen: Tensor) -> Tensor:
+        """Quaternions wxyz ``(*B, F, 4)`` of the tool in the world; zeros where it may be turned as it is.
+
+        Args:
+            path: ``(*B, F, 3)`` where the target is expected in 1 … F control steps [m, world].
+            target_pos: ``(*B, 3)`` where it is now.
+            seen: the entries ``in_keys``, ``(*B, …)`` each.
+        """
+        ...
+
+
+@dataclass(frozen=True, kw_only=True)
+class WithTarget:
+    """The tool is turned with the target, which keeps turned as it is: ``target_quat`` is read.
+
+    The default looks down on a target that lies flat: the tool's z axis is against the target's, and the x axes agree.
+    """
+
+    in_keys: ClassVar[tuple[str, ...]] = (keys.TARGET_QUAT,)
+
+    quat: tuple[float, float, float, float] = (0.0, 1.0, 0.0, 0.0)
+    """How the tool is turned in the target's frame, quaternion wxyz."""
+    symmetry: int = 1
+    """The tool is the same after one ``symmetry``-th of a turn about its z axis …"""
+    facing: tuple[float, float, float] = (1.0, 0.0, 0.0)
+    """… and of its turns that are alike it takes that whose x axis is nearest to this direction in the world: so that
+    no joint is turned farther and farther from target to target."""
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "quat", tuple(self.quat))
+        if len(self.quat) != 4 or not any(self.quat):
+            raise InputError(f"quat must be a quaternion wxyz other than zero, got {self.quat!r}")
+        for value in self.quat:
+            check_number("quat", value)
+        check_number("symmetry", self.symmetry, minimum=1, integer=True)
+        object.__setattr__(self, "facing", check_vector("facing", self.facing))
+
+    def __call__(self, path: Tensor, target_pos: Tensor, *seen: Tensor) -> Tensor:
+        """As of `Turn`."""
+        (target_quat,) = seen
+        check_trailing_shape(keys.TARGET_QUAT, target_quat, 4)
+        quat = quat_multiply(target_quat, target_quat.new_tensor(self.quat).expand_as(target_quat))
+        if self.symmetry > 1:
+            quat = self._nearest(quat)
+        return quat.unsqueeze(-2).expand(*path.shape[:-1], 4)
+
+    def _nearest(self, quat: Tensor) -> Tensor:
+        """Of the turns that are alike to ``quat`` (*B, 4) for the tool the one that faces as it should."""
+        half = math.pi / self.symmetry * torch.arange(self.symmetry, dtype=quat.dtype, device=quat.device)
+        zero = torch.zeros_like(half)
+        alike = torch.stack([half.cos(), zero, zero, half.sin()], dim=-1)
+        quats = quat_multiply(quat.unsqueeze(-2), alike)
+        faces = (quat_matrix(quats)[..., 0] * quats.new_tensor(self.facing)).sum(-1)
+        best = faces.argmax(-1)[..., None, None]
+        return quats.gather(-2, best.expand(*best.shape[:-1], 4)).squeeze(-2)

@@ -1,0 +1,162 @@
+"""Conveyor as a task: what varies, its planners, and where everything else of it is defined."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cache
+from typing import Any
+
+from torchdyn_plan.tasks.task import PlannerParts, Settings, Task, Truth, Verdict, Words, setting
+
+HORIZON = 200
+"""Control steps that forecasts look ahead: four seconds."""
+REACH = (0.4, 0.45)
+"""Parts are met no farther upstream and downstream than this [m]: the tool goes along with them before and after."""
+MARGIN = 0.8
+"""Share of the joints' acceleration limits by which the static planner brakes: servos lag a little."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class ConveyorSettings(Settings):
+    """How fast the belt is, and how many parts there are."""
+
+    speed: float = setting(
+        0.35, text="Speed of the belt", unit="m/s", minimum=0.05, maximum=1.0, sweep=(0.1, 0.2, 0.35, 0.6, 0.8)
+    )
+    parts: int = setting(1, text="Parts on the belt", minimum=1, maximum=8, sweep=(1, 2, 3, 4))
+
+
+@cache
+def scene() -> Any:
+    """Belt, parts and arm."""
+    from torchdyn_plan.envs.conveyor.scene import ConveyorScene
+
+    return ConveyorScene()
+
+
+def make_env(settings: ConveyorSettings, *, num_threads: int = 0, **batch: Any) -> Any:
+    """The environment at these settings; ``batch`` as `Task.make_env` says."""
+    from torchdyn_plan.envs.conveyor.env import ConveyorEnv
+
+    return ConveyorEnv(speed=settings.speed, parts=settings.parts, num_threads=num_threads, **batch)
+
+
+def arm() -> Any:
+    """The Panda with its cups."""
+    from torchdyn_plan.envs.conveyor.panda import panda_arm
+
+    return panda_arm(tool_length=scene().tool_length)
+
+
+def ik(*, chunk: int | None = None, weights: Any = None) -> Any:
+    """Brings the cups to a pose, by the joints' limits."""
+    from torchdyn_plan.envs.conveyor.panda import PANDA_LINKS
+    from torchdyn_plan.planners import IKPlanner, TurnedToGoal
+
+    return IKPlanner(
+        arm(),
+        approach=TurnedToGoal(),
+        control_step=scene().control_step,
+        acceleration=tuple(MARGIN * link.acceleration for link in PANDA_LINKS),
+        chunk=chunk,
+    )
+
+
+def gain(*, chunk: int | None = None, weights: Any = None) -> Any:
+    """The same by a gain alone, for goals at rest: it lags behind one that moves."""
+    from torchdyn_plan.planners import IKPlanner, TurnedToGoal
+
+    return IKPlanner(arm(), approach=TurnedToGoal(), control_step=scene().control_step, gain=0.1, chunk=chunk)
+
+
+def turn() -> Any:
+    """The cups are turned as the part is, half a turn the same: with the last joint as near to its middle as may be."""
+    from torchdyn_plan.planners import WithTarget
+
+    return WithTarget(symmetry=2, facing=(1.0, 1.0, 0.0))
+
+
+def maneuver() -> Any:
+    """Hovers, comes down with the belt's speed, holds until the cups do, and lifts."""
+    from torchdyn_plan.planners import MatchVelocity
+
+    how: dict[str, Any] = {"along_by": 0.8, "down_after": 0.3, "early_steps": 12}
+    return MatchVelocity(hover=0.1, descent_steps=40, hold_steps=8, lift_steps=20, **how)
+
+
+def dynamic(parts: PlannerParts, forecaster: Any) -> Any:
+    """The planner for one part, on that forecast."""
+    from torchdyn_plan.planners import DynamicPlanner, MetWithin, ReplanSchedule
+
+    own = maneuver()
+    return DynamicPlanner(
+        parts.static,
+        forecaster,
+        search=own.search(stride=5, first=5, margin=5.0, arrival_radius=0.06),
+        schedule=ReplanSchedule.every(5),
+        maneuver=own,
+        lost=MetWithin(low=(0.0, -REACH[0], 0.0), high=(1.0, REACH[1], 1.0)),
+        turn=turn(),
+        chunk=parts.chunk,
+        scene=scene().digest(),
+    ).eval()
+
+
+def forecaster() -> Any:
+    """The belt goes on as it does."""
+    from torchdyn_plan.nets import ConstantVelocity
+
+    return ConstantVelocity(horizon=HORIZON, control_step=scene().control_step)
+
+
+def meet(parts: PlannerParts) -> Any:
+    """Takes the part that can be had soonest, then the next; nothing of it is trained."""
+    from torchdyn_plan.planners import ChoosingPlanner
+
+    return ChoosingPlanner(dynamic(parts, forecaster())).eval()
+
+
+def first(parts: PlannerParts) -> Any:
+    """Takes the part that is farthest downstream, whatever comes behind it."""
+    return dynamic(parts, forecaster())
+
+
+def pursuit(parts: PlannerParts) -> Any:
+    """Runs after the part that is farthest downstream."""
+    from torchdyn_plan.planners import TargetPursuit
+
+    return TargetPursuit(parts.static, turn=turn(), scene=scene().digest()).eval()
+
+
+def truth(settings: ConveyorSettings, **episodes: Any) -> Truth:
+    """As `Task.truth` says: solvable is what the joints' limits let an arm meet that knows the belt."""
+    from torchdyn_plan.tasks.conveyor.solvable import find_truth
+
+    return find_truth(settings, **episodes)
+
+
+def judge(settings: ConveyorSettings, log: Any, truth: Truth) -> Verdict:
+    """As `Task.judge` says."""
+    import torch
+
+    cause = torch.where(truth.solvable, 1, 0).masked_fill(log.success, -1)
+    return Verdict(cause, {}, {})
+
+
+TASK = Task(
+    name="conveyor",
+    summary="A Panda takes parts off a belt.",
+    settings=ConveyorSettings,
+    words=Words(success="taken", steps="steps to take", target="part"),
+    max_steps=500,
+    control_step=0.02,
+    make_env=make_env,
+    digest=lambda: scene().digest(),
+    static_planners={"ik": ik, "gain": gain},
+    planners={"pursuit": pursuit, "meet": meet, "first": first},
+    rivals=("first",),
+    rows_at_once=(32, 64),
+    truth=truth,
+    causes=("out of reach", "missed"),
+    judge=judge,
+)
