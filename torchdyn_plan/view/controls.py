@@ -56,17 +56,17 @@ class Controls:
             steps.on_click(lambda event: self._jump(event.target.value))
             self._scrubber = self.gui.add_slider("Control step", 0, 1, 1, 0)
             self._scrubber.on_update(self._scrub)
-            speed = self.gui.add_dropdown("Speed", tuple(SPEEDS), "1/4")
+            speed = self.gui.add_dropdown("Speed", tuple(SPEEDS), initial_value="1/4")
             speed.on_update(lambda _: setattr(self, "speed", SPEEDS[speed.value]))
 
     def _who(self, scenarios: Sequence[Scenario]) -> None:
         task, names = self._first.task, tuple(self._first.task.planners)
         beside = scenarios[1].planner if len(scenarios) > 1 else NO_PLANNER
         with self.gui.add_folder("Planners"):
-            self._left = self._wanted(self.gui.add_dropdown("Planner", names, self._first.planner))
-            self._right = self._wanted(self.gui.add_dropdown("Beside it", (NO_PLANNER, *names), beside))
-            static = self._first.static or task.default_static
-            self._static = self._wanted(self.gui.add_dropdown("Static planner", tuple(task.static_planners), static))
+            self._left = self._wanted(self.gui.add_dropdown("Planner", names, initial_value=self._first.planner))
+            self._right = self._wanted(self.gui.add_dropdown("Beside it", (NO_PLANNER, *names), initial_value=beside))
+            statics, static = tuple(task.static_planners), self._first.static or task.default_static
+            self._static = self._wanted(self.gui.add_dropdown("Static planner", statics, initial_value=static))
 
     def _world(self) -> None:
         first, chosen = self._first, self._first.chosen
@@ -74,7 +74,7 @@ class Controls:
             number = self.gui.add_number("Episode", first.episode, min=0, max=LAST_EPISODE, step=1)
             self._episode = self._wanted(number)
             self._seed = self._wanted(self.gui.add_number("Seed", first.seed, min=0, step=1))
-            self._split = self._wanted(self.gui.add_dropdown("Split", SPLITS, first.split))
+            self._split = self._wanted(self.gui.add_dropdown("Split", SPLITS, initial_value=first.split))
             self._settings = {
                 one.name: self._wanted(self._setting(one, getattr(chosen, one.name)))
                 for one in dataclasses.fields(chosen)
@@ -85,7 +85,7 @@ class Controls:
         about, name = field.metadata, field.name.replace("_", " ")
         label = f"{name} [{about['unit']}]" if about.get("unit") else name
         if about.get("choices"):
-            return self.gui.add_dropdown(label, tuple(about["choices"]), value, hint=about.get("text"))
+            return self.gui.add_dropdown(label, tuple(about["choices"]), initial_value=value, hint=about.get("text"))
         if not isinstance(value, (int, float)):
             return self.gui.add_text(label, value, hint=about.get("text"))
         if about.get("sweep"):
@@ -105,7 +105,7 @@ class Controls:
                 self._sensor[name] = self._wanted(slider)
             names, track = (NO_TRACK, *TRACKS), self._first.track
             known = next((name for name, kind in TRACKS.items() if isinstance(track, kind)), NO_TRACK)
-            self._track = self._wanted(self.gui.add_dropdown("Track", names, known))
+            self._track = self._wanted(self.gui.add_dropdown("Track", names, initial_value=known))
 
     def _shown(self) -> None:
         with self.gui.add_folder("Shown", expand_by_default=False):

@@ -29,8 +29,8 @@ GRID = 17
 class Insight(NamedTuple):
     """What a plan was made from, of one robot. All that is unknown is NaN."""
 
-    made_at: int
-    """Control step since the reset."""
+    begin: int
+    """Control step since the reset from which on it counts: that in which the plan was to come into use."""
     path: Tensor
     """``(F, D)`` where the target was expected 1 … F control steps later [m, world]."""
     half_width: Tensor
@@ -48,19 +48,28 @@ class Insight(NamedTuple):
     """``(G,)`` control steps that it needs there; infinite for never."""
 
 
+class Shown(NamedTuple):
+    """What a goal search is shown of B robots, but for the arrival model."""
+
+    forecast: Forecast
+    target_pos: Tensor
+    """``(B, D)`` [m, world]."""
+    context: SearchContext
+
+
 @dataclass(kw_only=True, eq=False)
 class WatchedSearch:
     """A goal search that keeps what it is shown; it finds what the search inside finds."""
 
     search: GoalSearch
-    shown: list[tuple[Forecast, Tensor, SearchContext]] = field(default_factory=list)
-    """Forecast, target and context since they were last taken."""
+    shown: list[Shown] = field(default_factory=list)
+    """What it was shown since this was last asked for."""
 
     def __call__(
         self, forecast: Forecast, target_pos: Tensor, eta: ArrivalQuery, context: SearchContext = NO_CONTEXT
     ) -> Meeting:
         """As of `GoalSearch`."""
-        self.shown.append((forecast, target_pos, context))
+        self.shown.append(Shown(forecast, target_pos, context))
         return self.search(forecast, target_pos, eta, context)
 
 
@@ -86,46 +95,35 @@ class Watch:
         """
         if self._search is None or self._inner is None or not self._search.shown:
             return None
-        forecast, target_pos, context = self._search.shown[-1]
+        shown = self._search.shown[-1]
         self._search.shown.clear()
         delay = 0 if self._inner.delivery is None else self._inner.delivery.delay
-        return look_into(
-            self._inner, self._search.search, forecast, target_pos, context, robot_state, grid, step, delay
-        )
+        eta = self._inner.eta.from_state(robot_state)
+        return look_into(self._search.search, shown, eta, grid, step=step, delay=delay)
 
 
-def look_into(
-    planner: DynamicPlanner,
-    search: Any,
-    forecast: Forecast,
-    target_pos: Tensor,
-    context: SearchContext,
-    robot_state: Tensor,
-    grid: Tensor,
-    step: int,
-    delay: int,
-) -> Insight:
-    """The first row of what ``search`` was shown, as an `Insight`."""
-    path, now = forecast.path[:1], target_pos[:1]
-    eta, descent = planner.eta.from_state(robot_state), getattr(search, "descent_steps", 0.0)
+def look_into(search: Any, shown: Shown, eta: ArrivalQuery, grid: Tensor, *, step: int, delay: int) -> Insight:
+    """The first row of what ``search`` was ``shown`` at control step ``step``, of the time from ``delay`` later on."""
+    path, now, descent = shown.forecast.path[:1], shown.target_pos[:1], getattr(search, "descent_steps", 0.0)
+    lost_at = shown.context.lost
     if hasattr(search, "candidates"):
-        found = search.candidates(path, now, context.lost)
+        found = search.candidates(path, now, lost_at)
         thin = slice(None, None, -(-found.goals.shape[-2] // CANDIDATES))
         goals, target_steps = found.goals[:, thin], found.target_steps.expand(found.goals.shape[:-1])[:, thin]
         lost = None if found.lost is None else found.lost[:, thin]
     else:
         stride = -(-path.shape[-2] // CANDIDATES)
         goals, target_steps = path[:, stride - 1 :: stride], torch.arange(stride, path.shape[-2] + 1, stride)[None]
-        lost = None if context.lost is None else context.lost.forecast(goals)
+        lost = None if lost_at is None else lost_at.forecast(goals)
     slack = target_steps + delay - descent - _steps_to(eta, goals)
     half_width = torch.full_like(path[0, :, :2], torch.nan)
-    if forecast.spread is not None:
-        half_width = forecast.spread.interval(SHARE)[0]
+    if shown.forecast.spread is not None:
+        half_width = shown.forecast.spread.interval(SHARE)[0]
     places = search.goals(grid) if hasattr(search, "goals") else grid
     # A goal that is moved to where the tool can be says nothing of the place itself.
     moved = (places - grid)[:, :2].norm(dim=-1) > 1e-6
     return Insight(
-        made_at=step,
+        begin=step + delay,
         path=path[0],
         half_width=half_width,
         goals=goals[0],

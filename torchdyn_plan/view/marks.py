@@ -64,7 +64,7 @@ def ribbon(insight: Insight, step: int, unit: float) -> Marks:
     """The forecast from ``step`` on, as wide as the interval about it, and fainter the wider that is."""
     path, width = np_of(insight.path), np_of(insight.half_width)
     number = np.arange(0, len(path), max(1, len(path) // RIBBON))
-    to_come, path = insight.made_at + number + 1 > step, path[number]
+    to_come, path = insight.begin + number + 1 > step, path[number]
     width = np.clip(np.nan_to_num(width[number], nan=0.0), 0.0, 30.0 * unit) + 0.8 * unit
     # So many marks lie on top of each other, which together are to be as faint as one.
     apart = np.linalg.norm(np.diff(path, axis=0, append=path[-1:]), axis=1)
@@ -78,7 +78,7 @@ def candidates(recording: Recording, insight: Insight, step: int, unit: float) -
     """Meetings that could be, blue where the robot would wait for the target and orange where it would be late."""
     most = max(len(one.goals) for one in recording.insights)
     slack = np_of(insight.slack) * recording.scenario.task.control_step
-    opacity = np.where(insight.made_at + np_of(insight.target_steps) < step, 0.0, 0.85)
+    opacity = np.where(insight.begin + np_of(insight.target_steps) < step, 0.0, 0.85)
     marks = dots(np_of(insight.goals), 1.1 * unit, slack_colours(slack), opacity)
     missing = most - len(slack)
     return Marks(*(np.pad(value, ((0, missing), (0, 0))) for value in marks))

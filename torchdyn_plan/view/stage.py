@@ -54,7 +54,7 @@ class Stage:
         )
 
     def show(self, step: int, hidden: Collection[str] = ()) -> None:
-        """Bring everything to control step ``step``, without the layers ``hidden``; what has not changed is not sent."""
+        """Bring everything to control step ``step``, without the layers ``hidden``; viser sends what has changed."""
         now = min(step, self.recording.length)
         self._data.qpos[:] = self.recording.posture[now]
         mujoco.mj_kinematics(self._model, self._data)
