@@ -70,7 +70,7 @@ def test_it_plays_stops_at_the_end_steps_and_scrubs(served):
     assert "pursuit" in served.controls._said.content
     served.controls.play()
     assert served.playing
-    until(lambda: 0 < served.step)
+    until(lambda: served.step > 0)
     served.controls.pause()
 
 

@@ -48,7 +48,7 @@ def test_layers_have_as_many_marks_at_every_step(recording):
     for step in (0, recording.length // 2, recording.length):
         for marks in marks_at(recording, step).values():
             assert all(np.isfinite(value).all() for value in marks)
-            assert marks.colours.min() >= 0.0 and marks.colours.max() <= 1.0
+            assert ((marks.colours >= 0.0) & (marks.colours <= 1.0)).all()
 
 
 def test_nothing_of_a_plan_is_seen_before_the_first():

@@ -36,9 +36,7 @@ def test_a_recording_ends_as_the_episode_of_an_evaluation():
     for name in names:
         outcomes = found.outcomes[name]
         for episode in (1, 5, 7):
-            recording = record_episode(
-                chase(name, episode=episode, settings=CHASE.default_settings(**settings))
-            )
+            recording = record_episode(chase(name, episode=episode, settings=CHASE.default_settings(**settings)))
             assert recording.success == bool(outcomes.success[episode])
             cause = int(outcomes.cause[episode])
             assert recording.cause == (CHASE.causes[cause] if cause >= 0 else "")
@@ -158,7 +156,7 @@ def test_what_cannot_be_is_said(changes, words):
 
 
 def test_progress_may_end_a_recording():
-    class Enough(Exception):
+    class EnoughError(Exception):
         pass
 
     steps = []
@@ -166,8 +164,8 @@ def test_progress_may_end_a_recording():
     def count(step):
         steps.append(step)
         if step == 7:
-            raise Enough
+            raise EnoughError
 
-    with pytest.raises(Enough):
+    with pytest.raises(EnoughError):
         record_episode(chase(), count)
     assert steps == list(range(1, 8))

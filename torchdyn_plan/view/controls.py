@@ -177,6 +177,11 @@ class Controls:
             self.pause()
             self.page.go_to(self._scrubber.value)
 
+    @property
+    def says(self) -> str:
+        """What the page is doing, or what went wrong."""
+        return self._state.content
+
     def say_state(self, text: str) -> None:
         """Say what the page is doing."""
         self._state.content = text
