@@ -30,7 +30,7 @@ def meet():
 def test_a_recording_ends_as_the_episode_of_an_evaluation():
     """Successes, failures with their causes, and a planner that reads the truth."""
     names = ("pursuit", "meet", "oracle")
-    settings = {"speed": 1.2, "turning": 15.0}
+    settings = {"speed": 1.6, "turning": 15.0}
     found = evaluate("chase", names, episodes=8, progress=False, **settings)
     seen = set()
     for name in names:
@@ -81,8 +81,8 @@ def test_slack_says_which_meeting_is_the_first_that_can_be(meet):
 
 
 def test_the_region_is_where_the_robot_can_be_in_time(meet):
-    insight, planner = meet.insight(0), CHASE.planner("meet")
-    state = torch.tensor([[0.0, 0.0, 0.0, 0.0]])
+    insight, planner = meet.insights[0], CHASE.planner("meet")
+    state = torch.tensor([[*meet.tool_pos[insight.begin, :2], 0.0, 0.0]], dtype=torch.float32)
     known = planner.eta.from_state(state)(insight.region[None]).steps[0]
     torch.testing.assert_close(insight.region_steps, known)
     assert insight.region.abs().max() == meet.look.half_side
@@ -107,8 +107,9 @@ def test_a_watched_planner_does_what_it_does():
 def test_a_delayed_plan_is_of_later():
     recording = record_episode(chase(delivery=Delayed(10), episode=2))
     first = recording.insights[0]
-    assert first.begin == 10
-    np.testing.assert_allclose(first.path[0], recording.target_pos[11, :2], atol=1e-4)
+    planned = int(np.flatnonzero(recording.insight_at == 0)[0])
+    assert first.begin == planned + 10
+    np.testing.assert_allclose(first.path[0], recording.target_pos[first.begin + 1, :2], atol=1e-4)
 
 
 def test_a_planner_without_plans_has_none():

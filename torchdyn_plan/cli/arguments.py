@@ -116,13 +116,9 @@ class ViewArguments(PlannerArguments):
 
 
 @dataclass(frozen=True, kw_only=True)
-class RecordArguments(PlannerArguments):
-    """Draw an episode without a screen, its planners side by side: a film, or a strip of pictures."""
+class FilmArguments:
+    """How a film or a strip is drawn."""
 
-    out: Path
-    """File of the film, .webp, .gif or .mp4, or of the strip, .png."""
-    episode: int = 0
-    """Number of the episode."""
     width: int = 400
     """Width of each planner's picture [pixels]."""
     height: int = 300
@@ -137,6 +133,17 @@ class RecordArguments(PlannerArguments):
     """Pictures of a strip."""
     quality: int = 60
     """Of a WebP, 0 to 100."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class RecordArguments(PlannerArguments):
+    """Draw an episode without a screen, its planners side by side: a film, or a strip of pictures."""
+
+    out: Path
+    """File of the film, .webp, .gif or .mp4, or of the strip, .png."""
+    episode: int = 0
+    """Number of the episode."""
+    film: Any = None
     layers: tuple[str, ...] = ()
 
 

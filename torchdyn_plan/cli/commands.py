@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import importlib
 import sys
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import asdict, fields, replace
 from typing import TYPE_CHECKING, Any
 
@@ -191,19 +191,25 @@ def record(task: Task, arguments: RecordArguments) -> None:
     from torchdyn_plan.view import draw_without_screen
 
     draw_without_screen()
-    from torchdyn_plan.progress import progress_bar
     from torchdyn_plan.view import Film, check_film, record_episode, write_film
     from torchdyn_plan.view.words import outcome
 
-    check_film(arguments.out, strip=arguments.strip, quality=arguments.quality)
+    how = asdict(arguments.film)
+    size = {name: how.pop(name) for name in ("width", "height")}
+    check_film(arguments.out, strip=how["strip"], quality=how["quality"])
     recordings = [record_episode(scenario) for scenario in _scenarios(task, arguments)]
     for recording in recordings:
         say(f"{recording.scenario.planner}: {outcome(recording)}")
-    film = Film(recordings, width=arguments.width, height=arguments.height, layers=arguments.layers)
-    names = ("fps", "speed", "hold", "strip", "quality")
-    how = {name: getattr(arguments, name) for name in names}
-    write_film(film, arguments.out, progress=lambda steps: progress_bar(steps, unit="picture", leave=False), **how)
+    film = Film(recordings, layers=arguments.layers, **size)
+    write_film(film, arguments.out, progress=_drawing, **how)
     say(f"written: {arguments.out}, {arguments.out.stat().st_size / 1024:.0f} kB")
+
+
+def _drawing(steps: Iterable[int]) -> Iterable[int]:
+    """``steps``, and how far they are drawn."""
+    from torchdyn_plan.progress import progress_bar
+
+    return progress_bar(steps, desc="drawing", unit="picture", leave=False)
 
 
 def _scenarios(task: Task, arguments: ViewArguments | RecordArguments) -> list[Scenario]:

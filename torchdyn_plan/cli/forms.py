@@ -14,6 +14,7 @@ from torchdyn_plan.cli.arguments import (
     EnvArguments,
     EpisodeArguments,
     EvaluateArguments,
+    FilmArguments,
     FitArguments,
     KinematicsArguments,
     PlannerArguments,
@@ -91,7 +92,7 @@ def command_forms(task: Task, named: str) -> dict[str, type[Arguments]]:
             tracks=_option(Path | None, RECORDED, default=None, name="from"),
         ),
         "view": _planner_form(ViewArguments, task, named, SHOWN),
-        "record": _planner_form(RecordArguments, task, named, SHOWN, layers=_layers()),
+        "record": _planner_form(RecordArguments, task, named, SHOWN, layers=_layers(), film=_prefixed(FilmArguments)),
     }
 
 

@@ -192,7 +192,8 @@ def local_server(port: int) -> Any:
         server = LocalServer(host=HOST, port=port, label="torchdyn-plan", verbose=False)
     except (OSError, RuntimeError) as error:
         raise InputError(f"port {port} cannot be served: {error}") from error
-    server.gui.configure_theme(show_share_button=False, show_logo=False, control_layout="fixed", control_width="large")
+    server.gui.configure_theme(show_share_button=False, show_logo=False, control_width="large")
+    server.gui.main_panel.dock_right()
     server.scene.set_up_direction("+z")
     # Brighter than this the colours of marks fade.
     server.scene.configure_environment_map(environment_intensity=0.35)

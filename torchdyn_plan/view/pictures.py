@@ -46,6 +46,7 @@ class Film:
         self.recordings, self.width, self.height, self.layers = recordings, width, height, layers
         self.bar = max(16, round(0.09 * height))
         self._painters = [Painter(recording.look) for recording in recordings]
+        self._drawn: dict[int, tuple[int, Image.Image]] = {}
 
     @property
     def length(self) -> int:
@@ -56,13 +57,21 @@ class Film:
         """Control step ``step`` of all, ``(height + text, width of all, 3)`` uint8; raises as `Painter.picture`."""
         count = len(self.recordings)
         image = Image.new("RGB", (count * self.width + (count - 1) * GAP, self.height + 2 * self.bar), PAPER)
-        for number, (recording, painter) in enumerate(zip(self.recordings, self._painters, strict=True)):
+        for number, recording in enumerate(self.recordings):
             left, now = number * (self.width + GAP), min(step, recording.length)
-            marks = [marks for name, marks in marks_at(recording, now).items() if name in self.layers]
-            drawn = painter.picture(recording.posture[now], self.width, self.height, marks)
-            image.paste(Image.fromarray(drawn), (left, self.bar))
+            image.paste(self._draw(number, now), (left, self.bar))
             self._write(image, recording, left, now)
         return np.asarray(image)
+
+    def _draw(self, number: int, step: int) -> Image.Image:
+        """The world of recording ``number``, which is not drawn again while it does not move."""
+        before, drawn = self._drawn.get(number, (None, None))
+        if drawn is None or before != step:
+            recording, painter = self.recordings[number], self._painters[number]
+            marks = [marks for name, marks in marks_at(recording, step).items() if name in self.layers]
+            drawn = Image.fromarray(painter.picture(recording.posture[step], self.width, self.height, marks))
+            self._drawn[number] = step, drawn
+        return drawn
 
     def _write(self, image: Image.Image, recording: Recording, left: int, step: int) -> None:
         draw, middle = ImageDraw.Draw(image), left + self.width / 2
