@@ -1,11 +1,13 @@
 import os
+import subprocess
+import sys
+from pathlib import Path
 
 import numpy as np
 import pytest
 import torch
 from PIL import Image
 
-from tests.scripts import run
 from torchdyn_plan.cli.forms import LAYERS as NAMES
 from torchdyn_plan.envs import Sensor
 from torchdyn_plan.errors import InputError, OutputError
@@ -13,13 +15,18 @@ from torchdyn_plan.tasks import load_task
 from torchdyn_plan.view import Film, Scenario, files, record_episode, write_film
 from torchdyn_plan.view.marks import BLUE, LAYERS, ORANGE, marks_at, ribbon, slack_colours
 
-GRAPHICS = {"MUJOCO_GL": os.environ.get("MUJOCO_GL", "egl")}
+ROOT = Path(__file__).parents[2]
 CHASE = load_task("chase")
 
 
 @pytest.fixture(scope="module")
 def recording():
     return record_episode(Scenario(task=CHASE, planner="meet", episode=2, sensor=Sensor(rate=20.0, noise=0.01)))
+
+
+@pytest.fixture(scope="module")
+def exact():
+    return record_episode(Scenario(task=CHASE, planner="meet", episode=2))
 
 
 class Slides:
@@ -70,8 +77,8 @@ def test_candidates_are_blue_where_the_robot_is_early_and_orange_where_it_is_lat
     np.testing.assert_allclose(colours, [BLUE, (1.0, 1.0, 1.0), ORANGE, ORANGE])
 
 
-def test_a_forecast_is_fainter_and_wider_where_it_is_less_sure(recording):
-    insight = recording.insights[9]
+def test_a_forecast_is_fainter_and_wider_where_it_is_less_sure(exact):
+    insight = exact.insights[9]
     sure = insight._replace(half_width=torch.full_like(insight.half_width, 0.01))
     unsure = insight._replace(half_width=torch.full_like(insight.half_width, 0.5))
     one, other = (ribbon(which, insight.begin, 0.06) for which in (sure, unsure))
@@ -79,8 +86,8 @@ def test_a_forecast_is_fainter_and_wider_where_it_is_less_sure(recording):
     assert (one.sizes[:, :2] < other.sizes[:, :2]).all()
 
 
-def test_a_forecast_loses_what_has_passed(recording):
-    insight = recording.insights[0]
+def test_a_forecast_loses_what_has_passed(exact):
+    insight = exact.insights[0]
     seen = [(ribbon(insight, step, 0.06).colours[:, 3] > 0.0).sum() for step in (0, 100, 301)]
     assert seen[0] > seen[1] > seen[2] == 0
 
@@ -158,11 +165,14 @@ def test_films_of_nothing_or_of_no_size_are_refused(recording):
         Film([recording], width=10)
 
 
+@pytest.mark.slow
 def test_a_command_draws_an_episode_of_two_planners(tmp_path):
     """In a process of its own: graphics are chosen when MuJoCo is imported."""
     words = ["record", "--task", "chase", "--planners", "pursuit", "meet", "--episode", "2", "--film.speed", "2"]
     words += ["--film.fps", "5", "--film.width", "96", "--film.height", "80", "--out", "new/film.webp"]
-    ran = run(f"from torchdyn_plan.cli import main\nmain({words})", cwd=tmp_path, **GRAPHICS)
+    command = [sys.executable, "-m", "torchdyn_plan", *words]
+    environment = {**os.environ, "PYTHONPATH": str(ROOT), "MUJOCO_GL": os.environ.get("MUJOCO_GL", "egl")}
+    ran = subprocess.run(command, capture_output=True, text=True, check=False, cwd=tmp_path, env=environment)
     if "cannot draw" in ran.stderr:
         assert not (tmp_path / "new").exists()
         pytest.skip("no graphics here")
