@@ -76,7 +76,10 @@ class Driver:
         return self.tab.inner_text("body").split("Playback")[0].split("torchdyn-plan")[-1].strip()
 
     def scrub(self, step: int) -> None:
-        """Type ``step`` into the scrubber's box."""
+        """Type ``step`` into the scrubber's box; a page that plays would type over it."""
+        if self.page.playing:
+            self.press("Pause")
+            self.until("paused", lambda: not self.page.playing)
         box = self.tab.locator("input[type=text]:visible").first
         box.fill(str(step))
         box.press("Enter")
@@ -91,8 +94,16 @@ class Driver:
         """Press a button."""
         self.tab.get_by_role("button", name=name, exact=True).click()
 
+    def tidy(self) -> None:
+        """Close what viser says of drawing by software."""
+        notes = self.tab.locator(".mantine-Notification-closeButton")
+        while notes.count():
+            notes.first.click()
+            time.sleep(0.5)
+
     def shoot(self, name: str) -> None:
         """Save a screenshot, once everything is drawn."""
+        self.tidy()
         time.sleep(SETTLE)
         image = Image.open(io.BytesIO(self.tab.screenshot()))
         image.convert("RGB").save(self.out / f"{name}.webp", quality=70, method=6)

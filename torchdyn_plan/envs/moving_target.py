@@ -210,8 +210,8 @@ class MovingTargetEnv(EnvBase):
         """How the world is drawn: for a task that says nothing else, tool and target as balls above a floor."""
         from torchdyn_plan.envs.look import TARGET, TOOL, Ball, Look, bare_floor
 
-        balls = {"tool": Ball(0.04, TOOL), "target": Ball(0.03, TARGET)}
-        return Look(bare_floor(half_side=2.0), distance=4.0, elevation=-50.0, half_side=2.0, **balls)
+        tool, target, half_side = Ball(0.04, TOOL), Ball(0.03, TARGET), 2.0
+        return Look(bare_floor(half_side), distance=4.0, elevation=-50.0, half_side=half_side, tool=tool, target=target)
 
     def posture(self, row: int) -> np.ndarray[Any, Any]:
         """Generalised positions ``(nq,)`` of environment ``row`` now, of the model of `look`."""

@@ -134,7 +134,9 @@ class Controls:
 
     def scenarios(self) -> list[Scenario]:
         """What the panel says; raises `InputError` for a combination that cannot be."""
-        first, numbers = self._first, {name: slider.value for name, slider in self._sensor.items()}
+        first = self._first
+        numbers: dict[str, Any] = {name: slider.value for name, slider in self._sensor.items()}
+        # No rate is one measurement at each control step.
         sensor = Sensor(**(numbers | {"rate": numbers["rate"] or None}))
         settings = {name: handle.value for name, handle in self._settings.items()}
         changes: dict[str, Any] = {

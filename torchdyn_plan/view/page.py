@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import contextlib
+import math
 import sys
 import threading
 import time
@@ -23,7 +25,9 @@ RATE = 40.0
 """Steps of the page that are sent a second while it plays, at most [Hz]."""
 TOLD_EVERY = 25
 """The page says how far a recording is every so many control steps."""
-WIDER = 1.7
+FIELD_OF_VIEW = math.radians(45.0)
+"""From top to bottom, as MuJoCo's [rad]."""
+WIDER = 1.6
 """The camera stands so much farther away from two worlds than from one."""
 
 
@@ -140,9 +144,10 @@ class Page:
         """Let everybody who watches see ``count`` worlds."""
         place, lookat, _ = camera_of(self.recordings[0].look)
         place = lookat + (1.0 if count == 1 else WIDER) * (place - lookat)
-        cameras = [self.server.initial_camera, *(client.camera for client in self.server.get_clients().values())]
-        for camera in cameras:
-            camera.position, camera.look_at = place, lookat
+        for camera in (self.server.initial_camera, *(client.camera for client in self.server.get_clients().values())):
+            # One who has just come has no camera yet, and begins with the initial one.
+            with contextlib.suppress(AssertionError):
+                camera.position, camera.look_at, camera.fov = place, lookat, FIELD_OF_VIEW
 
     def _play(self) -> None:
         """Go on in time with the clock while the page plays."""
@@ -196,7 +201,7 @@ def local_server(port: int) -> Any:
     server.gui.main_panel.dock_right()
     server.scene.set_up_direction("+z")
     # Brighter than this the colours of marks fade.
-    server.scene.configure_environment_map(environment_intensity=0.35)
+    server.scene.configure_environment_map(environment_intensity=0.2)
     return server
 
 

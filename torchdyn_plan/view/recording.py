@@ -211,10 +211,9 @@ class Roll:
                 self.grid[:, 2] = planned[keys.TARGET_POS][0, 2]
             insight = self.watch.insight(planned[keys.ROBOT_STATE], self.grid, step)
             self.insights += [] if insight is None else [insight]
-        makes_plans = plan is not None and plan.get("status", None) is not None
         row = self._seen(planned, posture)
         row["goal"] = in_space(planned[keys.GOAL][0]) if keys.GOAL in planned.keys() else row["goal"]  # noqa: SIM118
-        if makes_plans:
+        if plan is not None and plan.get("status", None) is not None:
             row["countdown"], row["status"] = int(plan["arrival_steps"].item()), int(plan["status"].item())
             row["replans"] = int(plan["replans"].item())
         row["believed_pos"] = self._believed(planned, row["target_pos"])
