@@ -94,16 +94,8 @@ class Driver:
         """Press a button."""
         self.tab.get_by_role("button", name=name, exact=True).click()
 
-    def tidy(self) -> None:
-        """Close what viser says of drawing by software."""
-        notes = self.tab.locator(".mantine-Notification-closeButton")
-        while notes.count():
-            notes.first.click()
-            time.sleep(0.5)
-
     def shoot(self, name: str) -> None:
         """Save a screenshot, once everything is drawn."""
-        self.tidy()
         time.sleep(SETTLE)
         image = Image.open(io.BytesIO(self.tab.screenshot()))
         image.convert("RGB").save(self.out / f"{name}.webp", quality=70, method=6)
@@ -152,6 +144,8 @@ def main(arguments: Arguments) -> None:
             browser = playwright.chromium.launch(executable_path=arguments.chromium, args=FLAGS.split())
             tab = browser.new_page(viewport={"width": 1280, "height": 720})
             tab.goto(page.address)
+            # What viser says of drawing by software is about this machine.
+            tab.add_style_tag(content="[class*=Notification] { display: none !important }")
             drive(Driver(tab, page, arguments.out), arguments)
             browser.close()
     finally:
