@@ -67,7 +67,8 @@ def ribbon(insight: Insight, step: int, unit: float) -> Marks:
     to_come, path = insight.begin + number + 1 > step, path[number]
     width = np.clip(np.nan_to_num(width[number], nan=0.0), 0.0, 30.0 * unit) + 0.8 * unit
     # So many marks lie on top of each other, which together are to be as faint as one.
-    apart = np.linalg.norm(np.diff(path, axis=0, append=path[-1:]), axis=1)
+    apart = np.linalg.norm(np.diff(path, axis=0), axis=1)
+    apart = np.append(apart, apart[-1:] if len(apart) else 0.0)
     overlap = np.clip(2.0 * width.mean(axis=1) / np.maximum(apart, 1e-9), 1.0, len(path))
     opacity = 1.6 / (1.0 + width.mean(axis=1) / (3.0 * unit)) / overlap
     sizes = np.column_stack([width, np.full(len(number), 0.25 * unit)])
