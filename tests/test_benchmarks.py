@@ -38,10 +38,12 @@ SMALL = {
     "static_task": "--episodes 8 --split dev",
     "worst_case": "--planners corner --statics ik --calls 40 --seconds 1",
     "track": "--batches 1 2 --seconds 0.01",
+    "view": "--shown chase:pursuit --seconds 0.5",
 }
 ELSEWHERE = {
     "descriptions",
     "deviations",
+    "drive_page",
     "measure_arrivals",
     "nearest",
     "paper_scene",
@@ -51,7 +53,7 @@ ELSEWHERE = {
     "same_episodes",
 }
 """Minutes at the least, files of other packages, a picture of trainings, what the package's own arrival map is made by,
-or a comparison of files."""
+a browser, or a comparison of files."""
 PARTS = {"arms", "former_latency_side", "sides", "study"}
 """No scripts of their own."""
 
@@ -75,6 +77,8 @@ LONG = {
 def test_benchmark_runs(name, tmp_path):
     if name.startswith("reach") and importlib.util.find_spec("gymnasium_robotics") is None:
         pytest.skip("gymnasium-robotics has the arm")
+    if name == "view":
+        pytest.importorskip("mjviser")
     out = tmp_path / "figures.json"
     words = [*SMALL[name].split(), "--out", out]
     ran = run(BENCHMARKS / f"{name}.py", *words, cwd=BENCHMARKS.parent, OMP_NUM_THREADS="1", PATH="")

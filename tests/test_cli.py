@@ -46,7 +46,7 @@ ROW = {
     "success_solvable_repeats",
 }
 HEAVY = ("torch", "tensordict", "torchrl", "mujoco", "matplotlib", "numpy", "pytorch_kinematics")
-COMMANDS = ("evaluate", "sweep", "collect", "bench")
+COMMANDS = ("evaluate", "sweep", "collect", "bench", "view", "record")
 
 
 def answer(words, capsys):

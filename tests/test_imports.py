@@ -26,7 +26,8 @@ MAY_IMPORT = {
     "training": STUDIES,
     "evaluation": STUDIES,
     "bench": STUDIES | {"evaluation"},
-    "cli": STUDIES | {"training", "evaluation", "bench"},
+    "view": STUDIES | {"evaluation"},
+    "cli": STUDIES | {"training", "evaluation", "bench", "view"},
     "gym": set(),
 }
 TASKS = sorted(folder.name for folder in (ROOT / "tasks").iterdir() if (folder / "task.py").is_file())

@@ -12,6 +12,8 @@ from torchdyn_plan.errors import InputError, TorchdynPlanError
 from torchdyn_plan.stopping import Terminated, terminable
 
 PROGRAM = "torchdyn-plan"
+FILES = {".json", ".mp4", ".gif", ".webp", ".png"}
+"""Endings of files that commands write; other names are of folders."""
 
 
 def main(words: Sequence[str] | None = None) -> None:

@@ -68,24 +68,18 @@ class TrackArguments:
 
 
 @dataclass(frozen=True, kw_only=True)
-class EpisodeArguments(Arguments):
-    """Which episodes are run, and by which planners."""
+class PlannerArguments(Arguments):
+    """Who plays, and what they see."""
 
     planners: tuple[str, ...] = ()
     static: str = ""
     settings: Any = None
     weights: Path | None = None
     """Folder of the planners' networks, as train leaves it; those that ship when not given."""
-    episodes: int = 100
-    """Number of episodes for each planner, always episodes 0 to N-1; of a sweep for each value and repeat."""
     seed: int = 0
     """Which series of episodes; of a sweep the first one."""
     split: str = "test"
     """Which family of series: test, or dev for tuning."""
-    num_envs: int = 64
-    """Episodes that run side by side; does not change the results."""
-    threads: int = 0
-    """Threads of the simulation, 0 for all cores; does not change the results."""
     latency_ms: float = 0.0
     """Time by which every plan comes late, whole control steps; planners that make no plans have none."""
     sensor: Any = None
@@ -93,8 +87,64 @@ class EpisodeArguments(Arguments):
     track_settings: Any = None
     compensate: bool = True
     """Tell the planners of that time, so that they plan for the moment when the plan is there."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class EpisodeArguments(PlannerArguments):
+    """Which episodes are run, and by which planners."""
+
+    episodes: int = 100
+    """Number of episodes for each planner, always episodes 0 to N-1; of a sweep for each value and repeat."""
+    num_envs: int = 64
+    """Episodes that run side by side; does not change the results."""
+    threads: int = 0
+    """Threads of the simulation, 0 for all cores; does not change the results."""
     overwrite: bool = False
     """Take the place of results of something else that the folder holds; otherwise they are left, and refused."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class ViewArguments(PlannerArguments):
+    """Watch a task in a browser, on this machine alone: an episode step by step, and two planners side by side."""
+
+    out: ClassVar[None] = None
+
+    episode: int = 0
+    """Number of the episode that is shown first."""
+    port: int = 8080
+    """Port of the page, http://127.0.0.1:PORT; the next free one if it is taken."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class FilmArguments:
+    """How a film or a strip is drawn."""
+
+    width: int = 400
+    """Width of each planner's picture [pixels]."""
+    height: int = 300
+    """Height of the same [pixels]."""
+    fps: float = 25.0
+    """Pictures a second of a film."""
+    speed: float = 0.5
+    """Seconds of the episode in a second of the film."""
+    hold: float = 1.0
+    """Time for which a film's last picture stays [s]."""
+    strip: int = 8
+    """Pictures of a strip."""
+    quality: int = 60
+    """Of a WebP, 0 to 100."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class RecordArguments(PlannerArguments):
+    """Draw an episode without a screen, its planners side by side: a film, or a strip of pictures."""
+
+    out: Path
+    """File of the film, .webp, .gif or .mp4, or of the strip, .png."""
+    episode: int = 0
+    """Number of the episode."""
+    film: Any = None
+    layers: tuple[str, ...] = ()
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import importlib
 import sys
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import asdict, fields, replace
 from typing import TYPE_CHECKING, Any
 
@@ -18,10 +18,13 @@ from torchdyn_plan.cli.arguments import (
     EpisodeArguments,
     EvaluateArguments,
     FitArguments,
+    PlannerArguments,
     PolicyArguments,
+    RecordArguments,
     ReplanArguments,
     SweepArguments,
     TrainArguments,
+    ViewArguments,
     default_folder,
 )
 from torchdyn_plan.cli.output import say
@@ -31,6 +34,7 @@ from torchdyn_plan.tasks import Task
 if TYPE_CHECKING:
     from torchdyn_plan.envs.sensor import Sensor
     from torchdyn_plan.planners import Delivery, Track
+    from torchdyn_plan.view import Scenario
 
 
 def run(task: Task | None, arguments: Arguments) -> None:
@@ -175,11 +179,67 @@ def _short(value: Any) -> str:
     return f"{value:.5g}" if isinstance(value, float) else str(value)
 
 
+def view(task: Task, arguments: ViewArguments) -> None:
+    """Serve the page until it is interrupted."""
+    from torchdyn_plan.view import serve
+
+    serve(_scenarios(task, arguments), port=arguments.port, show=say)
+
+
+def record(task: Task, arguments: RecordArguments) -> None:
+    """Play the episode with each planner, draw it and write the file."""
+    from torchdyn_plan.view import draw_without_screen
+
+    draw_without_screen()
+    from torchdyn_plan.view import Film, check_film, record_episode, write_film
+    from torchdyn_plan.view.words import outcome
+
+    how = asdict(arguments.film)
+    size = {name: how.pop(name) for name in ("width", "height")}
+    check_film(arguments.out, strip=how["strip"], quality=how["quality"])
+    recordings = [record_episode(scenario) for scenario in _scenarios(task, arguments)]
+    for recording in recordings:
+        say(f"{recording.scenario.planner}: {outcome(recording)}")
+    film = Film(recordings, layers=arguments.layers, **size)
+    write_film(film, arguments.out, progress=_drawing, **how)
+    say(f"written: {arguments.out}, {arguments.out.stat().st_size / 1024:.0f} kB")
+
+
+def _drawing(steps: Iterable[int]) -> Iterable[int]:
+    """``steps``, and how far they are drawn."""
+    from torchdyn_plan.progress import progress_bar
+
+    return progress_bar(steps, desc="drawing", unit="picture", leave=False)
+
+
+def _scenarios(task: Task, arguments: ViewArguments | RecordArguments) -> list[Scenario]:
+    """The episode as each of the planners plays it."""
+    from torchdyn_plan.view import Scenario
+
+    if not arguments.planners:
+        raise InputError(f"planners must name at least one of {', '.join(task.planners)}")
+    sensor = _sensor(arguments)
+    shared: dict[str, Any] = {
+        "task": task,
+        "static": arguments.static,
+        "settings": task.default_settings(**asdict(arguments.settings)),
+        "weights": arguments.weights,
+        "delivery": _delivery(task, arguments),
+        "sensor": sensor,
+        "track": _track(arguments, sensor),
+    }
+    names = ("episode", "seed", "split")
+    shared |= {name: getattr(arguments, name) for name in names}
+    return [Scenario(planner=name, **shared) for name in arguments.planners]
+
+
 COMMANDS: dict[type[Arguments], Callable[[Any, Any], None]] = {
     EvaluateArguments: evaluate,
     SweepArguments: sweep,
     CollectArguments: collect,
     BenchArguments: bench,
+    ViewArguments: view,
+    RecordArguments: record,
 }
 """The arguments of each command but ``train``, and the function that serves it."""
 
@@ -203,7 +263,7 @@ def _shared(task: Task, arguments: EpisodeArguments) -> dict[str, Any]:
     }
 
 
-def _sensor(arguments: EpisodeArguments) -> Sensor | None:
+def _sensor(arguments: PlannerArguments) -> Sensor | None:
     """How targets are measured; None if exactly."""
     from torchdyn_plan.envs.sensor import Sensor
 
@@ -211,7 +271,7 @@ def _sensor(arguments: EpisodeArguments) -> Sensor | None:
     return None if sensor.is_exact else sensor
 
 
-def _track(arguments: EpisodeArguments, sensor: Sensor | None) -> Track | None:
+def _track(arguments: PlannerArguments, sensor: Sensor | None) -> Track | None:
     """What becomes of the measurements before planners see them; None if nothing does."""
     from torchdyn_plan.evaluation.tracks import track_named
 
@@ -219,7 +279,7 @@ def _track(arguments: EpisodeArguments, sensor: Sensor | None) -> Track | None:
     return track_named(arguments.track, sensor, **settings)
 
 
-def _delivery(task: Task, arguments: EpisodeArguments) -> Delivery | None:
+def _delivery(task: Task, arguments: PlannerArguments) -> Delivery | None:
     """How plans come late; None if they do not."""
     from torchdyn_plan.checks import check_number
     from torchdyn_plan.planners import Delayed

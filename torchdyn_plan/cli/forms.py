@@ -14,12 +14,16 @@ from torchdyn_plan.cli.arguments import (
     EnvArguments,
     EpisodeArguments,
     EvaluateArguments,
+    FilmArguments,
     FitArguments,
     KinematicsArguments,
+    PlannerArguments,
     PolicyArguments,
+    RecordArguments,
     ReplanArguments,
     SweepArguments,
     TrackArguments,
+    ViewArguments,
 )
 from torchdyn_plan.envs.sensor import Sensor
 from torchdyn_plan.errors import InputError
@@ -37,6 +41,9 @@ FITTED = {
 
 TRACKS = ("none", "least_squares", "kalman")
 """Tracks by name; tests hold them against `torchdyn_plan.evaluation.tracks`, which takes long to import."""
+LAYERS = ("region", "trail", "forecast", "candidates", "goal", "measurements", "track", "tool", "target")
+"""What is drawn beside a world; tests hold them against `torchdyn_plan.view.marks`, which takes long to import."""
+SHOWN = "Planners that are shown side by side."
 TRACK_TEXT = "Filter between sensor and planner; with none planners see the newest measurement, held."
 RECORDED = (
     "File of recorded tracks to take for paths, .csv, .parquet, .npy or .npz: time [s], x, y and z [m], track. "
@@ -86,6 +93,8 @@ def command_forms(task: Task, named: str) -> dict[str, type[Arguments]]:
             static=_static_option(task, "Static planner whose arrivals are measured."),
             tracks=_option(Path | None, RECORDED, default=None, name="from"),
         ),
+        "view": _planner_form(ViewArguments, task, named, SHOWN),
+        "record": _planner_form(RecordArguments, task, named, SHOWN, layers=_layers(), film=_prefixed(FilmArguments)),
     }
 
 
@@ -130,14 +139,17 @@ def train_forms(task: Task, named: str) -> dict[str, type[Arguments]]:
     return forms
 
 
-def _episode_form(base: type[EpisodeArguments], task: Task, named: str, **own: Any) -> type[EpisodeArguments]:
-    planners = _option(
-        tuple[str, ...], "Planners for the moving target.", choices=task.planners, default=task.default_planners
-    )
+def _episode_form(base: type[EpisodeArguments], task: Task, named: str, **own: Any) -> type[PlannerArguments]:
+    return _planner_form(base, task, named, "Planners for the moving target.", planners=task.default_planners, **own)
+
+
+def _planner_form(
+    base: type[PlannerArguments], task: Task, named: str, text: str, *, planners: tuple[str, ...] = (), **own: Any
+) -> type[PlannerArguments]:
     return _form(
         base,
         **_task_options(task, named),
-        planners=planners,
+        planners=_option(tuple[str, ...], text, choices=task.planners, default=planners or task.default_planners[-1:]),
         static=_static_option(task, "Static planner that drives the robot."),
         settings=_group(_settings_form(task)),
         sensor=_prefixed(_plain(Sensor)),
@@ -157,6 +169,10 @@ def _settings_form(task: Task) -> type[Any]:
         text = f"{about.get('text', one.name)}{unit}."
         fields[one.name] = _option(kinds[one.name], text, choices=about.get("choices", ()), default=one.default)
     return _form(None, f"Settings of {task.name}.", **fields)
+
+
+def _layers() -> tuple[Any, Any]:
+    return _option(tuple[str, ...], "What is drawn beside the world.", choices=LAYERS, default=LAYERS)
 
 
 def _over(task: Task) -> Any:

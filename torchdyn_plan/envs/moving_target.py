@@ -5,7 +5,7 @@ from __future__ import annotations
 import os
 from abc import abstractmethod
 from collections.abc import Callable, Mapping
-from typing import Any, ClassVar, NamedTuple
+from typing import TYPE_CHECKING, Any, ClassVar, NamedTuple
 
 import numpy as np
 import torch
@@ -21,6 +21,9 @@ from torchdyn_plan.envs.sensing import Sensed, Sensing
 from torchdyn_plan.envs.sensor import Sensor
 from torchdyn_plan.envs.specs import flag_spec, observation_spec
 from torchdyn_plan.errors import InputError
+
+if TYPE_CHECKING:
+    from torchdyn_plan.envs.look import Look
 
 ENDS = ("done", "terminated", "truncated")
 """Keys that tell whether an episode has ended."""
@@ -209,6 +212,17 @@ class MovingTargetEnv(EnvBase):
     def _picture(self, row: int, width: int, height: int) -> np.ndarray[Any, Any]:
         """A picture of environment ``row`` now, ``(height, width, 3)`` uint8, of tasks that can draw themselves."""
         raise InputError(f"{type(self).__name__} draws no pictures")
+
+    def look(self) -> Look:
+        """How the world is drawn: for a task that says nothing else, tool and target as balls above a floor."""
+        from torchdyn_plan.envs.look import TARGET, TOOL, Ball, Look, bare_floor
+
+        tool, target, half_side = Ball(0.04, TOOL), Ball(0.03, TARGET), 2.0
+        return Look(bare_floor(half_side), distance=4.0, elevation=-50.0, half_side=half_side, tool=tool, target=target)
+
+    def posture(self, row: int) -> np.ndarray[Any, Any]:
+        """Generalised positions ``(nq,)`` of environment ``row`` now, of the model of `look`."""
+        return np.zeros(0)
 
     def _reward(self, observed: Mapping[str, Tensor]) -> Tensor:
         """Rewards ``(N, 1)`` of a step after which ``observed`` is seen: 1 where the first flag holds."""

@@ -5,46 +5,32 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Any, NamedTuple
+from typing import Any
 
 import mujoco
 import numpy as np
 
 from torchdyn_plan.checks import check_number
+from torchdyn_plan.envs.look import Look, Marks
 from torchdyn_plan.errors import InputError
 
-ELEVATION = -35.0
-"""Cameras look down at this angle [deg]."""
 LARGEST = 1280
 """Longest side of a picture [pixels]."""
 
 
-class Sphere(NamedTuple):
-    """Something that is drawn beside the model."""
-
-    place: tuple[float, ...]
-    """Centre (3) [m, world]."""
-    radius: float
-    """[m]"""
-    colour: tuple[float, float, float, float]
-    """Red, green, blue and opacity, 0 to 1 each."""
-
-
 class Painter:
-    """Draws states of one model from one place; graphics start with the first picture."""
+    """Draws states of one world from one place; graphics start with the first picture."""
 
-    def __init__(
-        self, model: mujoco.MjModel, *, lookat: tuple[float, float, float], distance: float, azimuth: float
-    ) -> None:
-        """Look at the point ``lookat`` [m, world] from ``distance`` [m] and ``azimuth`` [deg]."""
-        self.model, self.data = model, mujoco.MjData(model)
+    def __init__(self, look: Look) -> None:
+        """Draw the model of ``look`` from where its camera stands."""
+        self.model, self.data = look.model, mujoco.MjData(look.model)
         self.camera = mujoco.MjvCamera()
-        self.camera.lookat[:], self.camera.distance = lookat, distance
-        self.camera.azimuth, self.camera.elevation = azimuth, ELEVATION
+        self.camera.lookat[:], self.camera.distance = look.lookat, look.distance
+        self.camera.azimuth, self.camera.elevation = look.azimuth, look.elevation
         self._renderer: mujoco.Renderer | None = None
 
     def picture(
-        self, qpos: np.ndarray[Any, Any], width: int, height: int, marks: Sequence[Sphere] = ()
+        self, qpos: np.ndarray[Any, Any], width: int, height: int, marks: Sequence[Marks] = ()
     ) -> np.ndarray[Any, Any]:
         """A picture ``(height, width, 3)`` uint8 of the model at generalised positions ``qpos`` (nq,), with ``marks``.
 
@@ -58,11 +44,7 @@ class Painter:
         mujoco.mj_forward(self.model, self.data)
         renderer.update_scene(self.data, self.camera)
         for mark in marks:
-            geom = renderer.scene.geoms[renderer.scene.ngeom]
-            size, turn = np.full(3, mark.radius), np.eye(3).flatten()
-            place, colour = np.array(mark.place), np.array(mark.colour, dtype=np.float32)
-            mujoco.mjv_initGeom(geom, mujoco.mjtGeom.mjGEOM_SPHERE, size, place, turn, colour)
-            renderer.scene.ngeom += 1
+            _add(renderer.scene, mark)
         return renderer.render().copy()
 
     def _sized(self, width: int, height: int) -> mujoco.Renderer:
@@ -81,3 +63,18 @@ class Painter:
                 "Python starts"
             ) from error
         return self._renderer
+
+
+def _add(scene: mujoco.MjvScene, marks: Marks) -> None:
+    """Add ``marks`` that can be seen to a scene that is about to be drawn; raises `InputError` if it is full."""
+    seen = (marks.colours[:, 3] > 0.0) & (marks.sizes.min(axis=1) > 0.0)
+    count, turn = int(seen.sum()), np.eye(3).flatten()
+    if scene.ngeom + count > scene.maxgeom:
+        raise InputError(f"a picture shows at most {scene.maxgeom} things, got {scene.ngeom + count}")
+    kept = (marks.places[seen], marks.sizes[seen], marks.colours[seen].astype(np.float32))
+    for place, size, colour in zip(*kept, strict=True):
+        geom = scene.geoms[scene.ngeom]
+        mujoco.mjv_initGeom(geom, mujoco.mjtGeom.mjGEOM_ELLIPSOID, size, place, turn, colour)
+        # No shadows of what is not there.
+        geom.category = mujoco.mjtCatBit.mjCAT_DECOR
+        scene.ngeom += 1

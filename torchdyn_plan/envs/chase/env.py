@@ -14,6 +14,7 @@ from torch import Tensor
 
 from torchdyn_plan.checks import check_number
 from torchdyn_plan.envs.episodes import draw_uniform
+from torchdyn_plan.envs.look import TARGET, TOOL, Ball, Look, bare_floor
 from torchdyn_plan.envs.moving_target import MovingTargetEnv, RobotReading
 
 if TYPE_CHECKING:
@@ -160,6 +161,20 @@ class ChaseEnv(MovingTargetEnv):
             start=walks.start[rows], heading=walks.heading[rows], turning=walks.turning[rows], speed=walks.speed
         )
         return chosen.at(self.world.control_step * ahead)
+
+    def look(self) -> Look:
+        """As of `MovingTargetEnv`: base and walker are balls of the size that counts as met."""
+        world = self.world
+        half_side = world.farthest + 1.5
+        return Look(
+            bare_floor(half_side),
+            distance=2.4 * half_side,
+            azimuth=90.0,
+            elevation=-70.0,
+            half_side=half_side,
+            tool=Ball(world.radius, TOOL),
+            target=Ball(0.6 * world.radius, TARGET),
+        )
 
     def _picture(self, row: int, width: int, height: int) -> np.ndarray[Any, Any]:
         from torchdyn_plan.envs.chase.picture import draw_world

@@ -13,8 +13,9 @@ from torchdyn_plan.checks import check_choice, check_number
 from torchdyn_plan.envs.fetch_reach.goal_motion import MOTIONS, GoalStarts, draw_goals, goal_places
 from torchdyn_plan.envs.fetch_reach.keys import REACHED
 from torchdyn_plan.envs.fetch_reach.simulation import ARM_JOINTS, CONTROL_STEP, FetchSimulation, fetch_digest
+from torchdyn_plan.envs.look import Ball, Look, Marks
 from torchdyn_plan.envs.moving_target import MovingTargetEnv, RobotReading
-from torchdyn_plan.envs.painter import Painter, Sphere
+from torchdyn_plan.envs.painter import Painter
 from torchdyn_plan.envs.sensor import Sensor
 
 MAX_STEPS = 50
@@ -173,10 +174,22 @@ class DynamicReachEnv(MovingTargetEnv):
     def _flags(self) -> dict[str, Tensor]:
         return {REACHED: self._reached}
 
+    def look(self) -> Look:
+        """As of `MovingTargetEnv`: the arm; the goal is no part of the model."""
+        model = self.simulation.model
+        # The model's own mark of a goal does not move.
+        model.site("target0").rgba[3] = 0.0
+        goal = Ball(0.02, (0.9, 0.1, 0.1, 1.0))
+        return Look(model, lookat=(1.1, 0.75, 0.5), distance=1.8, azimuth=130.0, half_side=0.5, target=goal)
+
+    def posture(self, row: int) -> np.ndarray[Any, Any]:
+        """As of `MovingTargetEnv`."""
+        return self.simulation.qpos[row].numpy().copy()
+
     def _picture(self, row: int, width: int, height: int) -> np.ndarray[Any, Any]:
+        look = self.look()
         if self._painter is None:
-            # The model's own mark of a goal does not move.
-            self.simulation.model.site("target0").rgba[3] = 0.0
-            self._painter = Painter(self.simulation.model, lookat=(1.1, 0.75, 0.5), distance=1.8, azimuth=130.0)
-        goal = Sphere(tuple(self._goal[row].tolist()), radius=0.02, colour=(0.9, 0.1, 0.1, 1.0))
-        return self._painter.picture(self.simulation.qpos[row].numpy(), width, height, [goal])
+            self._painter = Painter(look)
+        assert look.target is not None
+        goal = Marks.ball(tuple(self._goal[row].tolist()), *look.target)
+        return self._painter.picture(self.posture(row), width, height, [goal])

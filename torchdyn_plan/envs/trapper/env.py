@@ -10,8 +10,9 @@ import torch
 from torch import Tensor, nn
 
 from torchdyn_plan.checks import check_number
+from torchdyn_plan.envs.look import Look, Marks
 from torchdyn_plan.envs.moving_target import MovingTargetEnv, RobotReading
-from torchdyn_plan.envs.painter import Painter, Sphere
+from torchdyn_plan.envs.painter import Painter
 from torchdyn_plan.envs.sensor import Sensor
 from torchdyn_plan.envs.trapper.contact import is_covered, is_pocketed
 from torchdyn_plan.envs.trapper.keys import POCKETED, TRAPPED
@@ -173,11 +174,20 @@ class TrapperEnv(MovingTargetEnv):
             path[:, step] = twin.ball_pos[rows]
         return path
 
+    def look(self) -> Look:
+        """As of `MovingTargetEnv`: arm, box, table and ball."""
+        camera = {"lookat": (0.0, 0.0, -0.1), "distance": 2.5, "azimuth": 150.0}
+        return Look(self.simulation.model, half_side=self.scene.half_side, **camera)
+
+    def posture(self, row: int) -> np.ndarray[Any, Any]:
+        """As of `MovingTargetEnv`."""
+        return self.simulation.qpos[row].numpy().copy()
+
     def _picture(self, row: int, width: int, height: int) -> np.ndarray[Any, Any]:
         if self._painter is None:
-            self._painter = Painter(self.simulation.model, lookat=(0.0, 0.0, -0.1), distance=2.7, azimuth=150.0)
-        return self._painter.picture(self.simulation.qpos[row].numpy(), width, height, self._marks(row))
+            self._painter = Painter(self.look())
+        return self._painter.picture(self.posture(row), width, height, self._marks(row))
 
-    def _marks(self, row: int) -> list[Sphere]:
+    def _marks(self, row: int) -> list[Marks]:
         """What a picture of environment ``row`` shows beside the scene."""
         return []

@@ -12,7 +12,7 @@ from torchrl.data import Unbounded
 
 from torchdyn_plan.checks import check_number
 from torchdyn_plan.envs.episodes import episode_random
-from torchdyn_plan.envs.painter import Sphere
+from torchdyn_plan.envs.look import Marks
 from torchdyn_plan.envs.trapper.env import TrapperEnv
 from torchdyn_plan.envs.trapper.keys import REACHED, TOOL_ROTATION
 from torchdyn_plan.envs.trapper.reward import GoalReward, goal_reward, is_goal_reached
@@ -104,8 +104,8 @@ class TrapperGoalEnv(TrapperEnv):
         tool = self._tool_pos, self._tool_rotation
         return {REACHED: is_goal_reached(self.scene, self.weights, *tool, self._sought)}
 
-    def _marks(self, row: int) -> list[Sphere]:
-        return [Sphere(tuple(self.target_pos[row].tolist()), self.scene.ball_radius, (0.9, 0.1, 0.1, 0.5))]
+    def _marks(self, row: int) -> list[Marks]:
+        return [Marks.ball(tuple(self.target_pos[row].tolist()), self.scene.ball_radius, (0.9, 0.1, 0.1, 0.5))]
 
 
 def draw_goal_sequences(
