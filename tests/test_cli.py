@@ -45,7 +45,7 @@ ROW = {
     "success_solvable_repeats",
 }
 HEAVY = ("torch", "tensordict", "torchrl", "mujoco", "matplotlib", "numpy", "pytorch_kinematics")
-COMMANDS = ("evaluate", "sweep", "collect", "bench")
+COMMANDS = ("evaluate", "sweep", "report", "collect", "bench")
 
 
 def answer(words, capsys):

@@ -119,6 +119,16 @@ class SweepArguments(EpisodeArguments):
 
 
 @dataclass(frozen=True, kw_only=True)
+class ReportArguments:
+    """Draw the figures of the papers with the results of sweeps in them, as SVG and PNG."""
+
+    out: Path
+    """Folder for the figures, and for report.json with their points."""
+    results: Path | None = None
+    """Folder with the results of sweeps, at any depth; benchmarks/results of the checkout when not given."""
+
+
+@dataclass(frozen=True, kw_only=True)
 class CollectArguments(Arguments):
     """Gather training data: paths of targets nobody touches, or arrival times of a static planner."""
 

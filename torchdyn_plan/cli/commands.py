@@ -12,7 +12,6 @@ from torchdyn_plan.cli.arguments import (
     BENCHMARKS,
     DATA,
     TRAINING,
-    Arguments,
     BenchArguments,
     CollectArguments,
     EpisodeArguments,
@@ -20,6 +19,7 @@ from torchdyn_plan.cli.arguments import (
     FitArguments,
     PolicyArguments,
     ReplanArguments,
+    ReportArguments,
     SweepArguments,
     TrainArguments,
     default_folder,
@@ -33,8 +33,8 @@ if TYPE_CHECKING:
     from torchdyn_plan.planners import Delivery, Track
 
 
-def run(task: Task | None, arguments: Arguments) -> None:
-    """Run the command that takes these arguments; benchmarks may be given no task."""
+def run(task: Task | None, arguments: Any) -> None:
+    """Run the command that takes these arguments; benchmarks and reports may be given no task."""
     command = next(function for form, function in COMMANDS.items() if isinstance(arguments, form))
     command(task, arguments)
 
@@ -88,6 +88,16 @@ def sweep(task: Task, arguments: SweepArguments) -> None:
         **_shared(task, arguments),
     )
     say(format_table(task, rows))
+
+
+def report(task: Task | None, arguments: ReportArguments) -> None:
+    """Draw the figures of the task's paper, or of all tasks' papers, and say what there are no results of."""
+    from torchdyn_plan.evaluation.paper_figures import draw_report
+
+    found = draw_report(arguments.out, results=arguments.results, tasks=None if task is None else [task])
+    say(f"written: {', '.join(map(str, found.files))}")
+    if found.missing:
+        say("\n".join(["no results of ours, the paper's curve alone:", *found.missing]))
 
 
 def collect(task: Task, arguments: CollectArguments) -> None:
@@ -175,9 +185,10 @@ def _short(value: Any) -> str:
     return f"{value:.5g}" if isinstance(value, float) else str(value)
 
 
-COMMANDS: dict[type[Arguments], Callable[[Any, Any], None]] = {
+COMMANDS: dict[type[Any], Callable[[Any, Any], None]] = {
     EvaluateArguments: evaluate,
     SweepArguments: sweep,
+    ReportArguments: report,
     CollectArguments: collect,
     BenchArguments: bench,
 }

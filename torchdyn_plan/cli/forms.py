@@ -18,6 +18,7 @@ from torchdyn_plan.cli.arguments import (
     KinematicsArguments,
     PolicyArguments,
     ReplanArguments,
+    ReportArguments,
     SweepArguments,
     TrackArguments,
 )
@@ -72,11 +73,12 @@ def task_of(words: Sequence[str]) -> tuple[str, str | None, list[str]]:
     return task, named["--scene"], others
 
 
-def command_forms(task: Task, named: str) -> dict[str, type[Arguments]]:
+def command_forms(task: Task, named: str) -> dict[str, type[Any]]:
     """The arguments of each command but ``train`` and ``bench`` for ``task``, which the words call ``named``."""
     return {
         "evaluate": _episode_form(EvaluateArguments, task, named),
         "sweep": _episode_form(SweepArguments, task, named, over=_over(task)),
+        "report": ReportArguments,
         "collect": _form(
             CollectArguments,
             **_task_options(task, named),

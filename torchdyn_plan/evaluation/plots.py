@@ -110,7 +110,7 @@ def plot_sweep(task: Task, rows: Sequence[ResultRow], over: str, path: Path) -> 
         for planner in planners:
             _draw_curve(axes, [row for row in rows if row.planner == planner], over, panel, styles[planner])
         _draw_paper(axes, task, rows[0], over, panel)
-        axes.set(title=panel.title, ylim=(0, 1.02), xlabel=_axis(task, over))
+        axes.set(title=panel.title, ylim=(0, 1.02), xlabel=axis_label(task, over))
         axes.grid(alpha=0.3)
     all_axes[0].set_ylabel("success rate")
     handles, labels = all_axes[0].get_legend_handles_labels()
@@ -173,7 +173,8 @@ def _styles(task: Task, planners: Iterable[str]) -> dict[str, Style]:
     return {name: STYLES.get(name) or further[name] for name in names}
 
 
-def _axis(task: Task, over: str) -> str:
+def axis_label(task: Task, over: str) -> str:
+    """What stands along the axis of a setting, with its unit."""
     text = next(one.metadata.get("text", one.name) for one in fields(task.settings) if one.name == over)
     return f"{text} [{unit_of(task, over)}]" if unit_of(task, over) else text
 

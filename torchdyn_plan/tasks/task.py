@@ -23,6 +23,7 @@ if TYPE_CHECKING:
     from torch import Tensor
 
     from torchdyn_plan.envs.moving_target import MovingTargetEnv
+    from torchdyn_plan.evaluation.curves import PaperMoments, PaperPanel
 
 NEAREST_ETA = "nearest_eta"
 """Network of the times until the robot is as near to a goal as it can come, and the end of its weights' name."""
@@ -113,6 +114,10 @@ class PaperCurves(Protocol):
         self, planner: str, static: str, over: str, settings: Any, *, solvable: bool
     ) -> tuple[list[float], list[float]] | None:
         """The paper's curve over the setting ``over``, the others as in ``settings``: abscissae and success rates."""
+        ...
+
+    def panels(self) -> Sequence[PaperPanel | PaperMoments]:
+        """The diagrams of the paper's figures, which ``torchdyn-plan report`` draws with our results in them."""
         ...
 
 
