@@ -9,7 +9,7 @@ from typing import Any
 
 from torchdyn_plan.errors import InputError, OutputError
 from torchdyn_plan.files import check_writable_folder, is_folder, short_path, write_json
-from torchdyn_plan.versions import library_versions, machine
+from torchdyn_plan.versions import library_versions, machine, source_commit
 
 Row = dict[str, Any]
 
@@ -44,7 +44,7 @@ class Record:
             if self.out.suffix != ".json":
                 raise InputError(f"output file {short_path(self.out)} must end in .json")
             check_writable_folder(self.out.parent)
-            self.about |= {"machine": machine(), "versions": library_versions()}
+            self.about |= {"machine": machine(), "versions": library_versions(), "commit": source_commit()}
 
     def add(self, row: Mapping[str, Any]) -> None:
         """Save ``row`` and show it."""

@@ -16,6 +16,7 @@ BENCHMARKS = {
     "replan": "torchdyn_plan.bench.replan",
     "env": "torchdyn_plan.bench.env",
     "kinematics": "torchdyn_plan.bench.kinematics",
+    "all": "torchdyn_plan.bench.series",
 }
 """Name of each benchmark, and the module whose ``bench()`` measures and whose ``plot``, if any, draws the rows."""
 
@@ -241,4 +242,16 @@ class KinematicsArguments(BenchArguments):
     benchmark = "kinematics"
 
     compiled: bool = True
+    """Measure compiled forms too: they take minutes to compile."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class SeriesArguments(BenchArguments):
+    """Run every benchmark, into one file with versions, machine and commit."""
+
+    benchmark = "all"
+
+    seconds: float = 0.2
+    """Time spent on each figure of kinematics and re-plans [s]."""
+    compiled: bool = False
     """Measure compiled forms too: they take minutes to compile."""

@@ -19,6 +19,7 @@ from torchdyn_plan.cli.arguments import (
     PolicyArguments,
     ReplanArguments,
     ReportArguments,
+    SeriesArguments,
     SweepArguments,
     TrackArguments,
 )
@@ -103,6 +104,7 @@ def bench_forms(task: Task, named: str) -> dict[str, type[Arguments]]:
         ),
         "env": _form(EnvArguments, **_task_options(task, named)),
         "kinematics": _form(KinematicsArguments, **_task_options(task, named)),
+        "all": _form(SeriesArguments, **_task_options(task, named)),
     }
 
 
