@@ -161,8 +161,8 @@ def test_the_site_is_built_without_a_warning(tmp_path):
     if importlib.util.find_spec("mkdocs") is None or importlib.util.find_spec("mkdocstrings") is None:
         pytest.skip("mkdocs builds the site")
     build = [sys.executable, "-m", "mkdocs", "build", "--strict", "--site-dir", tmp_path]
-    run = {"cwd": ROOT, "capture_output": True, "text": True, "check": False}
-    built = subprocess.run(build, env={**os.environ, "NO_MKDOCS_2_WARNING": "1"}, **run)
+    quiet = {**os.environ, "NO_MKDOCS_2_WARNING": "1"}
+    built = subprocess.run(build, cwd=ROOT, env=quiet, capture_output=True, text=True, check=False)
     assert built.returncode == 0, built.stdout + built.stderr
     assert "WARNING" not in built.stderr
     assert "DynamicPlanner" in (tmp_path / "api" / "planners" / "index.html").read_text()
