@@ -144,3 +144,14 @@ def test_committed_results_have_the_papers_figures_in_them(drawn, tmp_path):
                 assert len(one.points) >= 5
                 assert all(point.deviation is not None for point in one.points)
     assert all(isinstance(one.panel, PaperPanel) for one in drawn)
+
+
+def test_committed_results_have_fetch_reach_in_them(drawn, tmp_path):
+    pytest.importorskip("gymnasium_robotics")
+    report = draw_report(tmp_path, tasks=["fetch_reach"])
+    assert report.missing == []
+    for planner in ("corner", "dher"):
+        (one,) = (one for one in drawn if one.line.planner == planner)
+        assert one.paper is not None
+        assert [point.x for point in one.points] == one.paper[0]
+        assert all(point.repeats == 10 for point in one.points)

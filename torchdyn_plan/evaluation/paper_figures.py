@@ -278,7 +278,8 @@ def _draw_band(axes: Axes, points: Sequence[Point], colour: str) -> None:
         (one.x, one.mean - one.deviation, one.mean + one.deviation) for one in points if one.deviation is not None
     ]
     if spread:
-        axes.fill_between(*zip(*spread, strict=True), color=colour, alpha=0.15, linewidth=0)
+        xs, low, high = zip(*spread, strict=True)
+        axes.fill_between(xs, low, high, color=colour, alpha=0.15, linewidth=0)
 
 
 def _number(task: Task, line: PaperLine) -> int:
