@@ -27,7 +27,7 @@ def drawn(monkeypatch):
     found = []
 
     class NoFigure:
-        def savefig(self, path, format):
+        def savefig(self, path, format, metadata):
             Path(path).write_text(format)
 
     def draw(tasks, lines, moments):
@@ -118,6 +118,8 @@ def test_a_figure_is_drawn_with_every_line_in_it(results, tmp_path):
     lines, moments = paper_figures._collect([TRAPPER], read_sweeps(results))
     chosen = [one for one in lines if one.panel.figure == "figure4_ik" and one.panel.place == (0, 1)]
     figure = paper_figures._draw([TRAPPER], chosen, moments)
+    for name in ("a", "b"):
+        (tmp_path / name).mkdir()
     (panel,) = (axes for axes in figure.axes if axes.get_title() == "Solvable episodes, over velocity")
     # Three planners of ours with a band each and of the paper; wait and drop has no results here, and no paper's curve.
     assert len(panel.lines) == 6
@@ -125,8 +127,9 @@ def test_a_figure_is_drawn_with_every_line_in_it(results, tmp_path):
     assert len({line.get_color() for line in panel.lines}) == 3
     (number_line,) = (axes for axes in figure.axes if axes.get_title() == "Re-plans of an episode")
     assert [label.get_text() for label in number_line.get_yticklabels()] == ["paper", "ours"]
-    figure.savefig(tmp_path / "figure.svg")
-    assert (tmp_path / "figure.svg").stat().st_size > 10_000
+    one, other = (paper_figures._save(figure, tmp_path / name / "figure.svg") for name in ("a", "b"))
+    assert one.stat().st_size > 10_000
+    assert one.read_bytes() == other.read_bytes()
 
 
 def test_the_schedule_plans_when_the_papers_does():
@@ -155,3 +158,11 @@ def test_committed_results_have_fetch_reach_in_them(drawn, tmp_path):
         assert one.paper is not None
         assert [point.x for point in one.points] == one.paper[0]
         assert all(point.repeats == 10 for point in one.points)
+
+
+def test_the_figures_of_the_pages_are_of_the_committed_results(drawn, tmp_path):
+    pytest.importorskip("gymnasium_robotics")
+    draw_report(tmp_path, tasks=["trapper", "fetch_reach"])
+    told = json.loads((RESULTS.parents[1] / "docs" / "figures" / "report.json").read_text())["lines"]
+    fresh = json.loads((tmp_path / "report.json").read_text())["lines"]
+    assert sorted(told, key=str) == sorted(fresh, key=str), "draw them again: torchdyn-plan report --out docs/figures"

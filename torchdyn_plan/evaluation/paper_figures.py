@@ -136,9 +136,7 @@ def draw_report(
     files = []
     for name in dict.fromkeys(panel.figure for panel in [*(one.panel for one in lines), *moments]):
         figure = _draw(known, [one for one in lines if one.panel.figure == name], _of(name, moments))
-        for ending in FORMATS:
-            files.append(folder / f"{name}.{ending}")
-            write_whole(files[-1], lambda path, figure=figure, ending=ending: figure.savefig(path, format=ending))
+        files += [_save(figure, folder / f"{name}.{ending}") for ending in FORMATS]
     files.append(folder / "report.json")
     write_json(files[-1], {"versions": library_versions(), "lines": [one.told() for one in lines]})
     lacking = [f"{one.panel.figure}: {one.panel.title}: {one.line.label}" for one in lines if not one.points]
@@ -258,10 +256,21 @@ def _draw(tasks: Sequence[Task], lines: Sequence[DrawnLine], moments: Sequence[P
     return figure
 
 
+def _save(figure: Figure, path: Path) -> Path:
+    """Write the figure, the same bytes each time; returns ``path``."""
+    from matplotlib import rc_context
+
+    ending = path.suffix.lstrip(".")
+    about = {"Date": None} if ending == "svg" else None
+    with rc_context({"svg.hashsalt": path.stem}):
+        write_whole(path, lambda place: figure.savefig(place, format=ending, metadata=about))
+    return path
+
+
 def _draw_panel(axes: Axes, task: Task, lines: Sequence[DrawnLine]) -> None:
     panel = lines[0].panel
     for one in lines:
-        style = {"color": _PALETTE[_number(task, one.line)], "label": one.line.label}
+        style: dict[str, Any] = {"color": _PALETTE[_number(task, one.line)], "label": one.line.label}
         if one.points:
             xs, means = [point.x for point in one.points], [point.mean for point in one.points]
             axes.plot(xs, means, marker=_MARKERS[_number(task, one.line)], markersize=4, linewidth=1.6, **style)
