@@ -1,4 +1,4 @@
-"""Rows of a benchmark as they come: each is in its file before anybody is told of it."""
+"""Rows of a benchmark: each is written to the file before it is shown."""
 
 from __future__ import annotations
 
@@ -17,8 +17,8 @@ Row = dict[str, Any]
 class Record:
     """The rows of one run of a benchmark, and the file that holds them.
 
-    A run that is killed leaves the rows that it has. Timings belong together: another run takes them anew, and its
-    first row takes the place of the old file.
+    A run that is killed leaves the rows that it has. Timings belong together: another run starts again, and its first
+    row replaces the old file.
     """
 
     def __init__(

@@ -29,7 +29,7 @@ ENDS = ("done", "terminated", "truncated")
 RENDER_MODES = ("rgb_array",)
 """What `MovingTargetEnv.render` can make."""
 ON_BAD_ACTION = ("raise", "hold")
-"""What becomes of an action that is no number: an error before anything moves, or 0 in its row."""
+"""Treatment of a NaN or infinite action: an error before anything moves, or 0 in its row."""
 
 
 class RobotReading(NamedTuple):
@@ -382,7 +382,7 @@ class MovingTargetEnv(EnvBase):
         return tensordict, TensorDict(entries, batch_size=self.batch_size, device=self.device)
 
     def _observe(self) -> dict[str, Tensor]:
-        """What is seen now, on the CPU; every entry has a memory of its own."""
+        """The present observation, on the CPU; no entry shares memory with another."""
         robot, history = self._robot(), (self._trace if self._sensing is None else self._held_trace).clone()
         target = history[:, -1].clone()
         observation = [robot.state]

@@ -25,7 +25,7 @@ Planner = Callable[[TensorDictBase], TensorDictBase]
 OFF_PATH = 0.002
 """A target this far off its path was touched [m]."""
 RENEWED_EVERY = 5
-"""The future of a target that is being touched is simulated anew every so many control steps."""
+"""Control steps after which the future of a target that is being touched is simulated again."""
 
 
 @dataclass(kw_only=True)

@@ -87,7 +87,7 @@ def evaluate(
         split: which family of series: ``test``, or ``dev`` for tuning.
         num_envs: episodes that run side by side; does not change the results of the task's own planners.
         num_threads: of the simulation, 0 for all cores; does not change the results.
-        delivery: how plans come into use, `torchdyn_plan.planners.Delayed` for one; planners that make no plans have
+        delivery: when plans become available, e.g. `torchdyn_plan.planners.Delayed`; planners that make no plans have
             none.
         sensor: how targets are measured; exactly for None.
         track: what becomes of the measurements before planners see them, `torchdyn_plan.planners.KalmanTrack` for one;
@@ -134,7 +134,7 @@ def evaluate(
         try:
             found.save(out, overwrite=overwrite)
         except OutputError as error:
-            # What cannot be saved is told at least.
+            # If it cannot be saved, it is at least printed.
             error.add_note(found.table())
             raise
     return found

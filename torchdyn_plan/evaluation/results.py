@@ -251,7 +251,7 @@ def over_repeats(row: ResultRow, repeats: Sequence[EpisodeOutcomes]) -> ResultRo
         return statistics.mean(rates), statistics.stdev(rates)
 
     everything = [float(one.success.double().mean()) for one in repeats]
-    # Without a solvable episode the mean is no number.
+    # Without a solvable episode the mean is NaN.
     possible = [float(one.success[one.solvable].double().mean()) for one in repeats]
     return dataclasses.replace(
         row,

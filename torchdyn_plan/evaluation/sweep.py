@@ -65,7 +65,7 @@ def sweep(
 ) -> list[ResultRow]:
     """Evaluate planners along the values of a setting, and write ``results.json`` and ``sweep.png``.
 
-    Points that lie in the folder are not run again.
+    Points that the folder already holds are not run again.
 
     Args:
         task: a task, or its name as `load_task` takes it.
@@ -80,9 +80,9 @@ def sweep(
         split: which family of series.
         num_envs: episodes that run side by side.
         num_threads: of the simulation, 0 for all cores.
-        delivery: how plans come into use.
+        delivery: when plans become available.
         sensor: how targets are measured.
-        track: what becomes of the measurements.
+        track: filter between sensor and planner.
         weights: folder of the networks of named planners.
         other_scene: let planners of another scene play, too.
         overwrite: remove whatever results are in the folder, points of this sweep among them.

@@ -1,4 +1,4 @@
-"""When an arm can be somewhere, from the limits of its joints alone: nothing is trained, and nothing simulated."""
+"""Arrival times of an arm from the limits of its joints, without training or simulation."""
 
 from __future__ import annotations
 

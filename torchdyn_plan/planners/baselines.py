@@ -34,7 +34,7 @@ class TargetPursuit(Remembering):
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         """Write ``goal`` (*B, D) [m, world] and ``arrival_steps`` (*B,), which is 0, and act.
 
-        Rows in which something that is read is no number get action 0.
+        Rows in which an input is NaN or infinite get action 0.
         """
         target_pos = read(tensordict, keys.TARGET_POS, "TargetPursuit")
         check_points(keys.TARGET_POS, target_pos)
@@ -127,7 +127,7 @@ def oracle_trajectory(
 
     Args:
         static: as of `DynamicPlanner`, like ``eta`` and ``parts``.
-        eta: tells how long ``static`` takes to a goal.
+        eta: predicts how long ``static`` needs to a goal.
         horizon: as far as its search may look into a recording [control steps].
         recorded: the truth is what was recorded before the episode with the robot at its start, ``target_future``
             (*B, T, D), and no longer true once the target was touched; else ``true_future`` (*B, F, D), which is.

@@ -59,7 +59,7 @@ def collect(
         num_threads: of the simulation, 0 for all cores; does not change the data.
         static: name of the static planner whose arrivals are measured; the task's default for None.
         weights: policy of that static planner, a file or a folder of its training; the one that ships for None.
-        planner: a person's own static planner, whose arrivals are measured in place of those of ``static``.
+        planner: your own static planner, whose arrivals are measured instead of those of ``static``.
         name: what the description calls it.
 
     Raises:
@@ -94,7 +94,7 @@ def collect(
 
 
 def collect_tracks(task: Task | str, file: Path, out: Path, *, seed: int = 0) -> int:
-    """Write a person's own recordings of targets into ``out``, as `collect` writes paths; returns how many there are.
+    """Write recorded targets into ``out``, in the format in which `collect` writes paths; returns their number.
 
     Args:
         task: whose control step they are brought to, or its name.

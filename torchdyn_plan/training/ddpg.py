@@ -136,7 +136,7 @@ class DDPG:
         return {name: float(value) / self.recipe.updates for name, value in totals.items()}
 
     def update(self, batch: TensorDictBase, number: int = 0) -> dict[str, Tensor]:
-        """One step of both networks and of their targets; raises `TrainingError` where a loss is no number."""
+        """One step of both networks and of their targets; raises `TrainingError` if a loss is NaN or infinite."""
         self.optimiser.zero_grad(set_to_none=True)
         figures = self.differentiate(batch, number)
         norms = [nn.utils.clip_grad_norm_(entry["params"], self.recipe.clip) for entry in self.optimiser.param_groups]

@@ -1,4 +1,4 @@
-"""A static planner for a point that has limits of speed and acceleration, and is told a velocity: a base, a drone."""
+"""Static planner for a point with limits on speed and acceleration and a velocity command: a base, a drone."""
 
 from __future__ import annotations
 
