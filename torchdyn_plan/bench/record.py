@@ -37,7 +37,7 @@ class Record:
         """
         self.rows: list[Row] = []
         self.out, self.show = None if out is None else Path(out), show
-        self.about = {"config": config}
+        self.about: dict[str, Any] = {"config": config}
         if self.out is not None:
             if is_folder(self.out):
                 raise OutputError(f"output file {short_path(self.out)} is a folder")
