@@ -76,7 +76,7 @@ def helped(words, capsys):
         ["train", "forecaster"],
         ["train", "policy"],
         ["train", "dher", "--task", "fetch_reach"],
-        *(["bench", name] for name in ("replan", "env", "kinematics")),
+        *(["bench", name] for name in ("replan", "env", "kinematics", "all")),
     ],
     ids=" ".join,
 )
