@@ -1,4 +1,4 @@
-"""What all tasks of meeting a moving target share as TorchRL environments: numbered episodes, keys, the history."""
+"""Base class of TorchRL environments with a moving target: numbered episodes, keys, the target's history."""
 
 from __future__ import annotations
 
@@ -23,22 +23,22 @@ from torchdyn_plan.envs.specs import flag_spec, observation_spec
 from torchdyn_plan.errors import InputError
 
 ENDS = ("done", "terminated", "truncated")
-"""Keys that tell whether an episode has ended."""
+"""Keys that mark the end of an episode."""
 
 
 RENDER_MODES = ("rgb_array",)
-"""What `MovingTargetEnv.render` can make."""
+"""Modes of `MovingTargetEnv.render`."""
 ON_BAD_ACTION = ("raise", "hold")
 """Treatment of a NaN or infinite action: an error before anything moves, or 0 in its row."""
 
 
 class RobotReading(NamedTuple):
-    """What N robots' sensors read, float32; the environment shows copies of these tensors."""
+    """Readings of N robots' sensors, float32; the environment returns copies of these tensors."""
 
     tool_pos: Tensor
     """``(N, D)`` [m, world]."""
     state: Tensor
-    """``(N, S)``: what a policy and an arrival model read, the tool's place among it."""
+    """``(N, S)``: input of policies and arrival models; includes the tool's position."""
     joint_pos: Tensor | None = None
     """``(N, joints)`` [rad]; None for a robot without joints."""
     joint_vel: Tensor | None = None
@@ -55,8 +55,8 @@ class MovingTargetEnv(EnvBase):
     next index when they reset, so that the same actions give bit-identical episodes whatever ``num_envs``.
 
     Actions are detached, and no tensor that is returned shares memory with the environment or with another entry: it
-    may be changed in place. `state_dict` holds where the series stands; an environment that loads it starts the
-    interrupted episodes again at its next reset, and goes on from there.
+    may be changed in place. `state_dict` stores the position in the series; an environment that loads it restarts
+    the interrupted episodes at its next reset and continues from there.
     """
 
     flags: ClassVar[tuple[str, ...]] = ()

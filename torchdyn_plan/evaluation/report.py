@@ -1,4 +1,4 @@
-"""Results as one table for the eye."""
+"""Results as a table of text."""
 
 from __future__ import annotations
 
@@ -41,7 +41,7 @@ def unit_of(task: Task, name: str) -> str:
 
 
 def plain(value: Any) -> str:
-    """A value for the eye."""
+    """A value as it is shown."""
     return f"{value:g}" if isinstance(value, (int, float)) and not isinstance(value, bool) else str(value)
 
 
@@ -51,7 +51,7 @@ def _varying(rows: Sequence[ResultRow]) -> list[str]:
 
 
 def _names(rows: Sequence[ResultRow], varying: Sequence[str]) -> Iterator[Column]:
-    """What tells the rows apart."""
+    """Columns that identify a row."""
     yield Column("planner", lambda row: row.planner)
     if len({row.static for row in rows}) > 1:
         yield Column("static", lambda row: row.static)
@@ -87,7 +87,7 @@ def _measures(rows: Sequence[ResultRow]) -> Iterator[Column]:
 
 
 def _track(rows: Sequence[ResultRow]) -> Iterator[Column]:
-    """What tracks made of measurements."""
+    """Counts of the measurements that tracks used, rejected, or restarted at."""
     for name in dict.fromkeys(name for row in rows for name in row.track):
         yield Column(f"track {name}", lambda row, name=name: _number(row.track.get(name), 1))
 

@@ -77,15 +77,15 @@ def sweep(
         static: as of `evaluate`, like all further arguments.
         episodes: number of episodes for each planner, value and repeat.
         seed: the first series of episodes.
-        split: which family of series.
-        num_envs: episodes that run side by side.
+        split: ``test`` or ``dev``.
+        num_envs: episodes simulated at once.
         num_threads: of the simulation, 0 for all cores.
         delivery: when plans become available.
-        sensor: how targets are measured.
+        sensor: sensor model of the target.
         track: filter between sensor and planner.
         weights: folder of the networks of named planners.
-        other_scene: let planners of another scene play, too.
-        overwrite: remove whatever results are in the folder, points of this sweep among them.
+        other_scene: allow planners that belong to another scene.
+        overwrite: remove all results in the folder, including points of this sweep.
         progress: show progress bars.
         settings: of the task, by name, but for the one that varies.
 

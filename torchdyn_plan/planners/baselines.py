@@ -22,10 +22,10 @@ from torchdyn_plan.planners.static.callable import TensorDictFunction
 
 
 class TargetPursuit(Remembering):
-    """Runs after the target: at every step the goal is where the target is now (paper, Section IV-A.1)."""
+    """Pursuit: at every step the goal is the target's present position (paper, Section IV-A.1)."""
 
     def __init__(self, static: StaticPlanner, *, scene: str | None = None) -> None:
-        """Run with ``static``, a planner for a static goal; ``scene`` is the digest of its scene, if it has one."""
+        """Build on ``static``, a planner for a static goal; ``scene`` is the digest of its scene, if it has one."""
         super().__init__()
         self.static, self.scene = TensorDictFunction.wrap(static), scene
         self.in_keys = keys_read(self.static, keys.TARGET_POS)
@@ -58,7 +58,7 @@ class EndOfForecast:
     def __call__(
         self, forecast: Forecast, target_pos: Tensor, eta: ArrivalQuery, context: SearchContext = NO_CONTEXT
     ) -> Meeting:
-        """The end of the forecast, in F steps; ``eta`` is asked once, whether the robot is ever there."""
+        """The end of the forecast, in F steps; ``eta`` is asked once whether the robot can reach it."""
         goal = forecast.path[..., -1, :]
         never = eta(goal.unsqueeze(-2)).never.squeeze(-1)
         steps = torch.full_like(never, forecast.path.shape[-2], dtype=torch.int64)
@@ -66,7 +66,7 @@ class EndOfForecast:
 
 
 class RecordedFuture(ForecastModel):
-    """Stands in for a forecaster and tells the truth, cut from a recording of the same episode.
+    """A forecaster that returns the true future, from a recording of the same episode.
 
     Entry k of ``target_future`` is where the target was at step k of the episode, with the arm held still.
     """

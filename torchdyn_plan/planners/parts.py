@@ -33,9 +33,9 @@ PARTS = ("static", "forecaster", "eta", "search", "schedule", "maneuver", "deliv
 
 
 class ComposedPlanner(PretrainedPlanner, Remembering):
-    """Holds the parts of a planner for a moving target; `DynamicPlanner` says what is done with them.
+    """Holds the parts of a planner for a moving target; `DynamicPlanner` uses them.
 
-    Parts do not change afterwards: `with_parts` makes another planner. In evaluation mode, in which planners are
+    Parts are immutable: `with_parts` makes another planner. In evaluation mode, in which planners are
     loaded, ``prepared`` holds copies of its models for inference. Plans are made by these wherever they stand for the
     models: `torchdyn_plan.nets.inference.Prepared` says where. ``train()`` drops them, ``eval()`` makes them again.
     """
@@ -56,19 +56,19 @@ class ComposedPlanner(PretrainedPlanner, Remembering):
         chunk: int | None = None,
         scene: str | None = None,
     ) -> None:
-        """Join the parts.
+        """Build from parts.
 
         Args:
             static: planner for a static goal, from tensordict to tensordict (`StaticPlanner`).
             forecaster: forecasts the target; a function of its history will do, which returns positions (*B, F, D). By
                 default constant velocity, `torchdyn_plan.nets.ConstantVelocity`.
             eta: predicts how long ``static`` needs to a goal; may be a function from robot states (*B, 1, S) and goals
-                (*B, K, D) to control steps (*B, K). By default what ``static`` says of itself.
-            search: chooses the meeting on the forecast; by default the first that can be made, of all its steps.
+                (*B, K, D) to control steps (*B, K). By default ``static.arrival_model()``.
+            search: chooses the meeting on the forecast; by default the first step at which both can be there.
             schedule: when to plan again; every fourth control step by default.
-            maneuver: which goal the static planner is sent to at each step; the meeting place by default.
+            maneuver: chooses the goal of the static planner at each step; the meeting place by default.
             delivery: when plans become available: `Delayed` or `Background`; at once by default.
-            lost: when a target is lost; None if it cannot be.
+            lost: decides when a target is lost; None if it cannot be.
             chunk: plan in blocks of exactly this many rows, so that results do not depend on the batch size.
             scene: digest of the scene that the planner belongs to; None if it belongs to none.
 
@@ -109,7 +109,7 @@ class ComposedPlanner(PretrainedPlanner, Remembering):
         return cls(static, forecaster, eta, **(own | parts))
 
     def with_parts(self, **parts: Any) -> Self:
-        """Another planner of the same parts, but for those given, by the names of the constructor's arguments."""
+        """Another planner with some parts replaced, by the names of the constructor's arguments."""
         for name in parts:
             check_choice("part", name, PARTS)
         return type(self)(**(self.part_settings() | parts)).train(self.training)
