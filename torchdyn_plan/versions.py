@@ -1,4 +1,4 @@
-"""What a result was made with: library versions and the machine, for every file of numbers."""
+"""Library versions and the machine, for every file of results."""
 
 import os
 import platform

@@ -60,7 +60,7 @@ class MovingTargetEnv(EnvBase):
     """
 
     flags: ClassVar[tuple[str, ...]] = ()
-    """Keys of what the task tells beside, bool ``(N, 1)`` each; the first one is success."""
+    """Keys of the task's flags, bool ``(N, 1)`` each; the first one is success."""
     scene_digest: str | None = None
     """Hash of the scene, which a planner that was made for one must share; None if there is nothing to confuse."""
 

@@ -20,7 +20,7 @@ LARGEST = 1280
 
 
 class Sphere(NamedTuple):
-    """Something that is drawn beside the model."""
+    """Something that is drawn in addition to the model."""
 
     place: tuple[float, ...]
     """Centre (3) [m, world]."""

@@ -206,7 +206,7 @@ def _is_disturbed(config: Mapping[str, Any]) -> bool:
 
 
 def _is_at(task: Task, panel: PaperPanel, settings: Mapping[str, Any]) -> bool:
-    """Whether ``settings`` are the panel's, whatever its abscissa."""
+    """Whether ``settings`` are the panel's, except for the one along its axis."""
     if panel.over not in settings:
         return False
     others = {name: value for name, value in settings.items() if name != panel.over}
@@ -226,7 +226,7 @@ def _point(panel: PaperPanel, row: _Row) -> Point | None:
 
 
 def _weight(point: Point | None) -> tuple[int, int]:
-    """How much a point is worth beside another one."""
+    """Rank of a point: more series first, then more episodes."""
     return (0, 0) if point is None else (point.repeats, point.episodes)
 
 

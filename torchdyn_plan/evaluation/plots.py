@@ -1,4 +1,4 @@
-"""Figures of results, beside the paper's. matplotlib is imported where a figure is drawn."""
+"""Figures of results with the paper's for comparison. matplotlib is imported where a figure is drawn."""
 
 from __future__ import annotations
 
@@ -166,7 +166,7 @@ def _panels_of(task: Task) -> list[_Panel]:
 
 
 def _styles(task: Task, planners: Iterable[str]) -> dict[str, Style]:
-    """The style of each planner of ``task``, and of those beside them."""
+    """The style of each planner of ``task``, and of others."""
     names = dict.fromkeys([*task.planners, *planners])
     others = [name for name in names if name not in STYLES]
     further = {name: FURTHER_STYLES[index % len(FURTHER_STYLES)] for index, name in enumerate(others)}

@@ -21,7 +21,7 @@ class Column(NamedTuple):
 
 
 def format_table(task: Task, rows: Sequence[ResultRow]) -> str:
-    """One aligned table of text: a line a row, rates in per cent, the paper's figure beside ours, ``–`` for none."""
+    """An aligned table of text: one line per row, rates in per cent, the paper's figure after ours, ``–`` for none."""
     varying = _varying(rows)
     columns = [*_names(rows, varying), *_rates(task, rows), *_causes(task, rows), *_measures(rows), *_track(rows)]
     lines = [[column.head for column in columns], *([column.cell(row) for column in columns] for row in rows)]

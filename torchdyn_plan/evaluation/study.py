@@ -159,7 +159,7 @@ def _tracked(name: str, planner: Planner, track: Track, task: Task) -> TrackedPl
 
 
 def _delivered(planner: Planner, delivery: Delivery) -> Planner:
-    """The same planner whose plans come by ``delivery``; one that makes no plans as it is."""
+    """The same planner with ``delivery``; a planner that makes no plans is returned unchanged."""
     if isinstance(planner, TrackedPlanner):
         return planner.with_planner(_delivered(planner.planner, delivery))
     return planner.with_parts(delivery=delivery) if isinstance(planner, DynamicPlanner) else planner

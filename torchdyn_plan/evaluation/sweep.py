@@ -33,11 +33,11 @@ class Point(TypedDict):
     """One value and repeat in a file."""
 
     identity: str
-    """Digest of what it is of."""
+    """Digest of the sweep and the point."""
     content: str
     """Digest of the planners' outcomes: a file that was damaged does not have it."""
     planners: dict[str, dict[str, Any]]
-    """How each planner's episodes ended."""
+    """Outcomes of each planner's episodes."""
 
 
 def sweep(

@@ -29,7 +29,7 @@ class GoalJoints(Protocol):
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class SolvedJoints:
-    """Joints by `solve_ik`: of all solutions that are found the one that is reached soonest."""
+    """Joints by `solve_ik`: of all solutions found, the one that is reached soonest."""
 
     arm: Arm
     """Whose tool is at the goal."""

@@ -22,9 +22,9 @@ class Judgement(NamedTuple):
     """Rows with an entry that is NaN, infinite or too large; None if every row is good."""
 
     blind: Tensor | None = None
-    """``(*B,)`` bool: what is read of the robot, or what its static planner remembers, is bad."""
+    """``(*B,)`` bool: the robot state, or the memory of its static planner, is bad."""
     bad_input: Tensor | None = None
-    """``(*B,)`` bool: what is read of the robot or of the target is bad."""
+    """``(*B,)`` bool: an entry of the robot or of the target is bad."""
     spoiled: Tensor | None = None
     """``(*B,)`` bool: what the planner remembers is bad."""
 

@@ -58,7 +58,7 @@ def setting(
 
 @dataclass(frozen=True, kw_only=True)
 class Settings:
-    """What varies from run to run of a task, beside its episodes; a task's own are a frozen subclass, by `setting`."""
+    """Settings of a task that vary from run to run; a task defines a frozen subclass with fields made by `setting`."""
 
     def __post_init__(self) -> None:
         from torchdyn_plan.checks import check_choice, check_number
@@ -84,7 +84,7 @@ class Words(NamedTuple):
 
 
 class Truth(NamedTuple):
-    """What is known of E episodes before a planner plays them."""
+    """What is known about E episodes before a planner runs them."""
 
     future: Tensor
     """``(E, T, D)`` positions of the targets at steps 0 … T-1, had no robot touched them [m, world]."""
@@ -93,18 +93,18 @@ class Truth(NamedTuple):
 
 
 class Verdict(NamedTuple):
-    """What a task says of E episodes that were played, ``(E,)`` each."""
+    """A task's assessment of E episodes, ``(E,)`` each."""
 
     cause: Tensor
-    """int64 index into `Task.causes` of what each failed of; -1 for a success."""
+    """int64 index into `Task.causes` of the cause of failure; -1 for a success."""
     flags: Mapping[str, Tensor]
     """Further outcomes, bool, by name."""
     evidence: Mapping[str, Tensor]
-    """What the causes follow from, by name."""
+    """Measurements from which the causes follow, by name."""
 
 
 class PaperCurves(Protocol):
-    """Success rates that a paper reports for a task, to stand beside ours."""
+    """Success rates that a paper reports for a task, for comparison with ours."""
 
     def rate(self, planner: str, static: str, settings: Any, *, solvable: bool) -> float | None:
         """The paper's success rate at these settings, over all or over solvable episodes; None where it has none."""

@@ -175,7 +175,7 @@ class _Wanted:
         return [torch.arange(first, min(first + self.num_envs, last)) for first in starts]
 
     def metadata(self, index: int, scene: str) -> dict[str, str]:
-        """What decides a shard's numbers, beside its name."""
+        """Everything that determines the content of a shard, apart from its name."""
         episodes = sum(map(len, self.blocks(index)))
         made = {"scene": scene, "num_envs": str(self.num_envs), "episodes": str(episodes)}
         if self.what == "arrivals":

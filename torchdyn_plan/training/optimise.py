@@ -68,7 +68,7 @@ class Recipe:
 
 
 class Progress(TypedDict):
-    """Where a fit stands, beside its tensors."""
+    """State of a fit, apart from its tensors."""
 
     step: Count
     total: float

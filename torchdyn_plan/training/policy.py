@@ -141,7 +141,7 @@ class Learner(TypedDict):
 
 
 class Progress(TypedDict):
-    """Where a training stands, beside its tensors."""
+    """State of a training, apart from its tensors."""
 
     curve: list[dict[str, float]]
     best: dict[str, float]

@@ -179,5 +179,5 @@ class TrapperEnv(MovingTargetEnv):
         return self._painter.picture(self.simulation.qpos[row].numpy(), width, height, self._marks(row))
 
     def _marks(self, row: int) -> list[Sphere]:
-        """What a picture of environment ``row`` shows beside the scene."""
+        """What a picture of environment ``row`` shows in addition to the scene."""
         return []

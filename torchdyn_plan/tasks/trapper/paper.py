@@ -1,4 +1,4 @@
-"""The paper's success rates, read off its Figure 4, to stand beside ours."""
+"""The paper's success rates, read off its Figure 4, for comparison with ours."""
 
 from __future__ import annotations
 
