@@ -20,10 +20,10 @@ FADE = 0.25
 
 
 class PointPlanner(StaticPlannerModule):
-    """Moves a point straight to ``goal`` at the highest speed allowed; ``action`` is its velocity as a fraction of its speed.
+    """Moves a point straight to ``goal`` as fast as allowed; ``action`` is velocity as a fraction of the speed limit.
 
     Reads ``tool_pos`` (*B, D) and ``goal`` (*B, D) [m, world], writes ``action`` (*B, D) of size 0 to 1. One that stops
-    slows down as its acceleration lets it. It remembers nothing.
+    brakes within its acceleration. It has no memory.
     """
 
     def __init__(
