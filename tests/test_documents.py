@@ -135,7 +135,7 @@ def test_links_lead_to_files_and_headings(page):
 
 def test_slugs_are_those_of_the_site():
     markdown = pytest.importorskip("markdown.extensions.toc")
-    for heading in ("Sooner: `--algorithm averaged`", "A planner, with nothing trained", "The scene `paper`", "A & B"):
+    for heading in ("A planner, with nothing trained", "The scene `paper`", "A & B"):
         plain = heading.replace("`", "")
         assert slug(heading) == markdown.slugify(plain, "-"), heading
 
