@@ -149,7 +149,6 @@ def test_the_walk_sees_imports_at_both_levels():
 @pytest.mark.parametrize(
     ("statement", "absent"),
     [
-        ("import torchdyn_plan.planners", SIMULATION | {"pytorch_kinematics"}),
         ("import torchdyn_plan.cli", HEAVY | {"tyro"}),
         ("import torchdyn_plan.tasks; torchdyn_plan.tasks.load_task('trapper')", HEAVY),
         ("import torchdyn_plan; dir(torchdyn_plan); torchdyn_plan.load_task", HEAVY),
