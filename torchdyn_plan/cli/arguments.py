@@ -121,7 +121,7 @@ class SweepArguments(EpisodeArguments):
 
 @dataclass(frozen=True, kw_only=True)
 class ReportArguments:
-    """Draw the figures of the papers with the results of sweeps in them, as SVG and PNG."""
+    """Draw the figures of the papers of all tasks, or of --task NAME, with our results in them, as SVG and PNG."""
 
     out: Path
     """Folder for the figures, and for report.json with their points."""
