@@ -6,7 +6,7 @@ unexport PYTHONPATH PYTHONHOME
 export PIP_USER := 0
 export UV_PYTHON_DOWNLOADS ?= never
 
-.PHONY: demo test check torture lock environment clean
+.PHONY: demo test check docs torture lock environment clean
 
 demo: environment
 	$(BIN)/torchdyn-plan evaluate --static ik --planners pursuit corner oracle wait_and_drop --velocity 3 --episodes 100 --seed 0 --out runs/demo --overwrite
@@ -20,6 +20,10 @@ check: environment
 	$(BIN)/ruff format --check .
 	$(BIN)/basedpyright
 	OMP_NUM_THREADS=1 $(BIN)/pytest -q -n 2 --dist worksteal
+
+# The site, in build/site; any warning is an error.
+docs: environment
+	NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs build --strict
 
 # Every promise under hostile users, damaged files, full disks and crashes: half an hour. A killed run goes on.
 torture: environment

@@ -46,7 +46,7 @@ ROW = {
     "success_solvable_repeats",
 }
 HEAVY = ("torch", "tensordict", "torchrl", "mujoco", "matplotlib", "numpy", "pytorch_kinematics")
-COMMANDS = ("evaluate", "sweep", "collect", "bench", "view", "record")
+COMMANDS = ("evaluate", "sweep", "report", "collect", "bench", "view", "record")
 
 
 def answer(words, capsys):
@@ -77,7 +77,7 @@ def helped(words, capsys):
         ["train", "forecaster"],
         ["train", "policy"],
         ["train", "dher", "--task", "fetch_reach"],
-        *(["bench", name] for name in ("replan", "env", "kinematics")),
+        *(["bench", name] for name in ("replan", "env", "kinematics", "all")),
     ],
     ids=" ".join,
 )

@@ -1,7 +1,13 @@
 """README and the pages of docs: their Python runs, their commands are understood, their links lead somewhere."""
 
+import functools
+import importlib.util
+import json
+import os
 import re
 import shlex
+import subprocess
+import sys
 from pathlib import Path
 
 import pytest
@@ -12,7 +18,12 @@ from torchdyn_plan.cli import commands, main
 ROOT = Path(__file__).parent.parent
 WALKS = {"own-task.md"}
 """Pages whose blocks build on one another: `test_a_walk_is_walked` runs them in order."""
-PAGES = [ROOT / "README.md", *sorted(file for file in (ROOT / "docs").glob("*.md") if file.name not in WALKS)]
+DOCS = sorted((ROOT / "docs").rglob("*.md"))
+WHOLE = [ROOT / "README.md", ROOT / "CHANGELOG.md", ROOT / "CONTRIBUTING.md", *DOCS]
+"""Every page whose links are followed."""
+PAGES = [ROOT / "README.md", *(file for file in DOCS if file.name not in WALKS)]
+NOTEBOOKS = sorted((ROOT / "docs" / "notebooks").glob("*.ipynb"))
+LINK = re.compile(r"\]\(([^)\s]+)\)")
 
 
 def blocks(language):
@@ -97,12 +108,81 @@ def test_a_walk_is_walked(name, tmp_path):
     assert met["learned"] >= 90, printed
 
 
-@pytest.mark.parametrize("page", [ROOT / "README.md", *(ROOT / "docs").glob("*.md")], ids=lambda page: page.name)
-def test_links_lead_to_files(page):
-    for link in re.findall(r"\]\(([^)#]+)\)", page.read_text()):
-        if not link.startswith("http"):
-            assert (page.parent / link).exists(), link
+@functools.cache
+def anchors(page):
+    """What a page's headings can be linked by."""
+    text = re.sub(r"```.*?```", "", page.read_text(), flags=re.DOTALL)
+    return {slug(heading) for heading in re.findall(r"^#+ +(.*)$", text, re.MULTILINE)}
+
+
+def slug(heading):
+    words = re.sub(r"[^\w\s-]", "", heading.replace("`", "")).strip().lower()
+    return re.sub(r"[-\s]+", "-", words)
+
+
+@pytest.mark.parametrize("page", WHOLE, ids=lambda page: str(page.relative_to(ROOT)))
+def test_links_lead_to_files_and_headings(page):
+    for link in LINK.findall(page.read_text()):
+        if "://" in link:
+            continue
+        path, _, anchor = link.partition("#")
+        target = page.parent / path if path else page
+        # The site has the changelog as a page.
+        assert target.exists() or link == "changelog.md", link
+        if anchor:
+            assert anchor in anchors(target), link
+
+
+def test_slugs_are_those_of_the_site():
+    markdown = pytest.importorskip("markdown.extensions.toc")
+    for heading in ("A planner, with nothing trained", "The scene `paper`", "A & B"):
+        plain = heading.replace("`", "")
+        assert slug(heading) == markdown.slugify(plain, "-"), heading
+
+
+def test_every_page_is_in_the_navigation():
+    named = set(re.findall(r": (\S+\.md)$", (ROOT / "mkdocs.yml").read_text(), re.MULTILINE))
+    assert named == {str(page.relative_to(ROOT / "docs")) for page in DOCS} | {"changelog.md"}
+
+
+def test_the_api_names_modules_that_there_are():
+    named = [
+        name
+        for page in (ROOT / "docs" / "api").glob("*.md")
+        for name in re.findall(r"^::: (\S+)$", page.read_text(), re.M)
+    ]
+    assert len(named) > 20
+    for name in named:
+        assert importlib.util.find_spec(name) is not None, name
+
+
+@pytest.mark.slow
+def test_the_site_is_built_without_a_warning(tmp_path):
+    if importlib.util.find_spec("mkdocs") is None or importlib.util.find_spec("mkdocstrings") is None:
+        pytest.skip("mkdocs builds the site")
+    build = [sys.executable, "-m", "mkdocs", "build", "--strict", "--site-dir", tmp_path]
+    quiet = {**os.environ, "NO_MKDOCS_2_WARNING": "1"}
+    built = subprocess.run(build, cwd=ROOT, env=quiet, capture_output=True, text=True, check=False)
+    assert built.returncode == 0, built.stdout + built.stderr
+    assert "WARNING" not in built.stderr
+    assert "DynamicPlanner" in (tmp_path / "api" / "planners" / "index.html").read_text()
+    assert (tmp_path / "source" / "examples" / "own_task.py").is_file()
+
+
+@pytest.mark.parametrize("notebook", NOTEBOOKS, ids=lambda file: file.stem)
+def test_notebooks_run_and_are_stripped(notebook, tmp_path):
+    cells = json.loads(notebook.read_text())["cells"]
+    code = ["".join(cell["source"]) for cell in cells if cell["cell_type"] == "code"]
+    assert len(code) >= 5
+    assert not any(cell.get("outputs") for cell in cells)
+    ran = run("\n".join(code), cwd=tmp_path)
+    assert ran.returncode == 0, ran.stderr
+    assert ran.stdout
+
+
+def test_there_are_two_notebooks():
+    assert [file.stem for file in NOTEBOOKS] == ["first_plan", "kinematics"]
 
 
 def test_readme_fits_on_a_few_screens():
-    assert len((ROOT / "README.md").read_text().splitlines()) <= 150
+    assert len((ROOT / "README.md").read_text().splitlines()) <= 120

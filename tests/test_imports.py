@@ -152,7 +152,6 @@ def test_the_walk_sees_imports_at_both_levels():
 @pytest.mark.parametrize(
     ("statement", "absent"),
     [
-        ("import torchdyn_plan.planners", SIMULATION | {"pytorch_kinematics"}),
         ("import torchdyn_plan.cli", HEAVY | {"tyro"}),
         ("import torchdyn_plan.tasks; torchdyn_plan.tasks.load_task('trapper')", HEAVY),
         ("import torchdyn_plan; dir(torchdyn_plan); torchdyn_plan.load_task", HEAVY),
@@ -163,3 +162,25 @@ def test_importing_stays_light(statement, absent):
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)
     assert done.returncode == 0, done.stderr
     assert done.stdout.split() == []
+
+
+MAY_LOAD = {
+    # tensordict itself takes seconds, as it imports torch._dynamo; what is above it is ours.
+    "import torch, tensordict.nn": ("import torchdyn_plan.planners", {"torchdyn_plan"}),
+    "": (
+        "import contextlib; from torchdyn_plan.cli import main\nwith contextlib.suppress(SystemExit): main(['--help'])",
+        {"torchdyn_plan", "tyro", "docstring_parser", "typing_extensions", "typeguard"},
+    ),
+}
+"""What is there already, what is run then, and the packages that it may load beside Python's own."""
+
+
+@pytest.mark.parametrize("before", MAY_LOAD)
+def test_planners_and_help_load_nothing_else(before):
+    statement, allowed = MAY_LOAD[before]
+    code = f"import sys\n{before}\nknown = {{*sys.modules}}\n{statement}\nprint('new:', *({{*sys.modules}} - known))"
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    new = {name.split(".")[0] for name in done.stdout.splitlines()[-1].removeprefix("new:").split()}
+    assert "torchdyn_plan" in new
+    others = {name for name in new - sys.stdlib_module_names if not name.startswith("_")}
+    assert others <= allowed, sorted(others - allowed)

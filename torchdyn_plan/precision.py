@@ -34,7 +34,7 @@ Result = TypeVar("Result")
 
 
 class Precise(nn.Module):
-    """A module whose buffers are constants of geometry: in float32 at least, whatever its parameters are."""
+    """A module whose buffers are constants of geometry: at least float32, for any dtype of its parameters."""
 
     def _apply(self, fn: Callable[[Tensor], Tensor], recurse: bool = True) -> Self:
         """As of `nn.Module`, which moves and converts by it; buffers are converted from what they were."""

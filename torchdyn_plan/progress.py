@@ -86,7 +86,7 @@ class Lines:
         self.note = f", {text}"
 
     def reset(self, total: int) -> None:
-        """Begin anew, of ``total`` things."""
+        """Restart with ``total`` items."""
         self.n, self.told, self.total = 0, 0, total
 
     def close(self) -> None:

@@ -29,7 +29,7 @@ def terminable() -> Iterator[None]:
 
 @contextmanager
 def stop_when_safe() -> Iterator[Callable[[], bool]]:
-    """Within it the first Ctrl-C or SIGTERM is but noted, for what is yielded to tell, and takes effect at the end.
+    """Context in which the first Ctrl-C or SIGTERM is only recorded, and takes effect at the end.
 
     A second one takes effect at once. Signals for which Python has no handler of its own are left alone, and so are
     threads but the main one.

@@ -1,7 +1,8 @@
-"""What a result was made with: library versions and the machine, for every file of numbers."""
+"""Library versions and the machine, for every file of results."""
 
 import os
 import platform
+import subprocess
 from importlib import metadata
 from pathlib import Path
 
@@ -33,6 +34,19 @@ def machine() -> dict[str, str | int | None]:
         "memory_gib": _memory_gib(),
         "gpu": _gpu_name(),
     }
+
+
+def source_commit() -> str | None:
+    """Commit of the checkout that the package runs from, ``-dirty`` behind it after changes; None outside of one."""
+    folder = Path(__file__).resolve().parent.parent
+    if not (folder / ".git").exists():
+        return None
+    describe = ["git", "-C", str(folder), "describe", "--always", "--dirty", "--exclude=*", "--abbrev=12"]
+    try:
+        done = subprocess.run(describe, capture_output=True, text=True, check=False, timeout=30)
+    except (OSError, subprocess.TimeoutExpired):
+        return None
+    return done.stdout.strip() or None
 
 
 def usable_cores() -> int:

@@ -302,7 +302,7 @@ def test_a_run_that_is_killed_leaves_its_rows_and_another_takes_them_anew(tmp_pa
     assert len(json.loads(out.read_text())["rows"]) == 3
     rows = bench(own.PLANNER, batches=(2,), out=out, **QUICK)
     content = json.loads(out.read_text())
-    assert content.keys() == {"config", "machine", "versions", "complete", "rows"}
+    assert content.keys() == {"config", "machine", "versions", "commit", "complete", "rows"}
     assert content["complete"]
     assert content["rows"] == rows
     assert {row["batch"] for row in rows} == {2}

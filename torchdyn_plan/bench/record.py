@@ -1,4 +1,4 @@
-"""Rows of a benchmark as they come: each is in its file before anybody is told of it."""
+"""Rows of a benchmark: each is written to the file before it is shown."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from typing import Any
 
 from torchdyn_plan.errors import InputError, OutputError
 from torchdyn_plan.files import check_writable_folder, is_folder, short_path, write_json
-from torchdyn_plan.versions import library_versions, machine
+from torchdyn_plan.versions import library_versions, machine, source_commit
 
 Row = dict[str, Any]
 
@@ -17,8 +17,8 @@ Row = dict[str, Any]
 class Record:
     """The rows of one run of a benchmark, and the file that holds them.
 
-    A run that is killed leaves the rows that it has. Timings belong together: another run takes them anew, and its
-    first row takes the place of the old file.
+    A run that is killed leaves the rows that it has. Timings belong together: another run starts again, and its first
+    row replaces the old file.
     """
 
     def __init__(
@@ -37,14 +37,14 @@ class Record:
         """
         self.rows: list[Row] = []
         self.out, self.show = None if out is None else Path(out), show
-        self.about = {"config": config}
+        self.about: dict[str, Any] = {"config": config}
         if self.out is not None:
             if is_folder(self.out):
                 raise OutputError(f"output file {short_path(self.out)} is a folder")
             if self.out.suffix != ".json":
                 raise InputError(f"output file {short_path(self.out)} must end in .json")
             check_writable_folder(self.out.parent)
-            self.about |= {"machine": machine(), "versions": library_versions()}
+            self.about |= {"machine": machine(), "versions": library_versions(), "commit": source_commit()}
 
     def add(self, row: Mapping[str, Any]) -> None:
         """Save ``row`` and show it."""

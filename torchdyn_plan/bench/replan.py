@@ -78,7 +78,7 @@ def bench(
         device: where planners run, ``cpu`` or ``cuda``; afterwards they are where they were.
         compiled: also measure re-plans and networks compiled; each takes up to three compilations of a minute or less.
         out: JSON file for the rows, written with each of them: a run that is killed leaves those that it has. Timings
-            are never continued: another run begins anew.
+            are never continued: another run starts again.
         progress: show a progress bar.
         show: is given each row once it is measured and saved.
 

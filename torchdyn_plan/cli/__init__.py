@@ -96,8 +96,10 @@ def _run(words: Sequence[str]) -> None:
     choices: dict[str, Any] = {**forms.command_forms(task, named), "bench": BenchArguments, "train": TrainArguments}
     about = {"prog": PROGRAM, "description": "Planners for static targets, made to meet moving ones.", "args": others}
     parsed = commands.with_folders(task, tyro.extras.subcommand_cli_from_dict(choices, **about))
+    # A report is of all tasks, unless one is asked for.
+    all_tasks = others[:1] == ["report"] and len(others) == len(words)
     with _unless_in_vain(parsed):
-        commands.run(task, parsed)
+        commands.run(None if all_tasks else task, parsed)
 
 
 def _unless_in_vain(arguments: Any) -> AbstractContextManager[None]:

@@ -1,7 +1,7 @@
-"""What each command takes; `torchdyn_plan.cli.forms` adds what a task has to choose from.
+"""Arguments of each command; `torchdyn_plan.cli.forms` adds the choices of a task.
 
-Types alone are settled here: values are checked by what they are handed to, so that Python and the command line say the
-same.
+Only types are fixed here: values are checked by the functions that receive them, so that Python and the command line
+give the same errors.
 """
 
 from __future__ import annotations
@@ -16,6 +16,7 @@ BENCHMARKS = {
     "replan": "torchdyn_plan.bench.replan",
     "env": "torchdyn_plan.bench.env",
     "kinematics": "torchdyn_plan.bench.kinematics",
+    "all": "torchdyn_plan.bench.series",
 }
 """Name of each benchmark, and the module whose ``bench()`` measures and whose ``plot``, if any, draws the rows."""
 
@@ -32,31 +33,31 @@ def default_folder(base: Path, task: str, static: str = "") -> Path:
 
 @dataclass(frozen=True, kw_only=True)
 class Arguments:
-    """What every command takes; its task and scene are read from the words before anything else."""
+    """Arguments of every command; task and scene are read from the command line before anything else."""
 
     task: str = DEFAULT
 
 
 @dataclass(frozen=True, kw_only=True)
 class TrackArguments:
-    """What a track is told; its own where not given, and not every track has each."""
+    """Parameters of the track; the track's own defaults where not given. Not every track has all of them."""
 
     noise: float | None = None
     """Standard deviation of a measurement's error along each axis [m]; the sensor's when not given."""
     speed: float | None = None
-    """Standard deviation of the speed along each axis of a target of which nothing is known [m/s]."""
+    """Standard deviation of the initial speed along each axis [m/s]."""
     max_speed: float | None = None
     """No target moves faster [m/s]."""
     gate: float | None = None
-    """A measurement fits up to so many standard deviations of what is expected of it."""
+    """Largest deviation of a measurement from its prediction that is accepted [standard deviations]."""
     rebound: float | None = None
-    """Share of the speed that is taken to come back from a bounce."""
+    """Share of the speed that is assumed to remain after a bounce."""
     patience: float | None = None
-    """So long a track is of use without a measurement [s]."""
+    """Time without a measurement after which a track is lost [s]."""
     least: int | None = None
-    """Measurements from which on a track is of use."""
+    """Measurements that a track needs before it is used."""
     oldest: float | None = None
-    """A measurement older than the newest one by more than this is not used [s]."""
+    """Largest age of a measurement relative to the newest one [s]."""
     window: float | None = None
     """Of least_squares: time over which a measurement's weight falls to 1/e [s]."""
     agility: float | None = None
@@ -64,7 +65,7 @@ class TrackArguments:
     accelerates: bool | None = None
     """Of kalman: whether the acceleration is constant, and not the velocity."""
     acceleration: float | None = None
-    """Of kalman that accelerates: standard deviation of an acceleration of which nothing is known [m/s²]."""
+    """Of kalman with accelerates: standard deviation of the initial acceleration [m/s²]."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -77,16 +78,16 @@ class PlannerArguments(Arguments):
     weights: Path | None = None
     """Folder of the planners' networks, as train leaves it; those that ship when not given."""
     seed: int = 0
-    """Which series of episodes; of a sweep the first one."""
+    """Series of episodes; in a sweep the first one."""
     split: str = "test"
     """Which family of series: test, or dev for tuning."""
     latency_ms: float = 0.0
-    """Time by which every plan comes late, whole control steps; planners that make no plans have none."""
+    """Delay of every plan, a multiple of the control step; no effect on planners that make no plans."""
     sensor: Any = None
     track: str = "none"
     track_settings: Any = None
     compensate: bool = True
-    """Tell the planners of that time, so that they plan for the moment when the plan is there."""
+    """Let planners plan for the moment at which the delayed plan is available."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -94,13 +95,13 @@ class EpisodeArguments(PlannerArguments):
     """Which episodes are run, and by which planners."""
 
     episodes: int = 100
-    """Number of episodes for each planner, always episodes 0 to N-1; of a sweep for each value and repeat."""
+    """Episodes for each planner, always numbers 0 to N-1; in a sweep for each value and repeat."""
     num_envs: int = 64
     """Episodes that run side by side; does not change the results."""
     threads: int = 0
     """Threads of the simulation, 0 for all cores; does not change the results."""
     overwrite: bool = False
-    """Take the place of results of something else that the folder holds; otherwise they are left, and refused."""
+    """Replace results of another configuration in the folder; without it they are kept, and the command stops."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -161,23 +162,33 @@ class SweepArguments(EpisodeArguments):
 
     over: str
     out: Path
-    """Folder of the sweep: its points, results.json and the plot. One that holds points already is continued."""
+    """Folder of the sweep: its points, results.json and the plot. Existing points are not run again."""
     values: tuple[float, ...] = ()
     """Values of the setting; the paper's when none are given, or the task's."""
     repeats: int = 10
-    """Series of episodes for each value, with seeds upwards from the first."""
+    """Series of episodes for each value, with consecutive seeds."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class ReportArguments:
+    """Draw the figures of the papers of all tasks, or of --task NAME, with our results in them, as SVG and PNG."""
+
+    out: Path
+    """Folder for the figures, and for report.json with their points."""
+    results: Path | None = None
+    """Folder with the results of sweeps, at any depth; benchmarks/results of the checkout when not given."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class CollectArguments(Arguments):
-    """Gather training data: paths of targets nobody touches, or arrival times of a static planner."""
+    """Collect training data: paths of undisturbed targets, or arrival times of a static planner."""
 
     what: str
     static: str = ""
     out: Path | None = None
     """Folder for the shards of data; runs/data/TASK-STATIC when not given."""
     weights: Path | None = None
-    """Of a static planner that is a policy: a file, or a folder of its training; the one that ships when not given."""
+    """Weights of a static planner that is a policy: file, or folder of its training; the shipped ones by default."""
     tracks: Path | None = None
     episodes: int = 20000
     """Number of targets, or of sequences of runs of the static planner."""
@@ -191,11 +202,11 @@ class CollectArguments(Arguments):
 
 @dataclass(frozen=True, kw_only=True)
 class TrainArguments(Arguments):
-    """Train a network, on collected data or by trial; a killed run continues where its folder stands."""
+    """Train a network on collected data, or a policy; a killed run continues from its folder."""
 
     out: Path | None = None
-    """Folder for checkpoints, curve and weights, in which each network has its own; when not given,
-    runs/training/TASK-STATIC, and of policies runs/training/TASK."""
+    """Folder for checkpoints, curve and weights, with a folder for each network in it; runs/training/TASK-STATIC
+    when not given, for policies runs/training/TASK."""
     steps: int | None = None
     """Optimiser steps; the recipe's own when not given."""
     batch: int | None = None
@@ -221,7 +232,7 @@ class FitArguments(TrainArguments):
 
 @dataclass(frozen=True, kw_only=True)
 class PolicyArguments(TrainArguments):
-    """Train a policy by trial."""
+    """Train a policy by reinforcement learning."""
 
     steps: int | None = None
     """Rounds of episodes and updates; the recipe's own when not given."""
@@ -242,7 +253,7 @@ class BenchArguments(Arguments):
     benchmark: ClassVar[str]
 
     out: Path | None = None
-    """JSON file for the figures, written with each: a run that is killed leaves those it has; another begins anew."""
+    """JSON file for the figures, written after each one; a killed run leaves what it has, the next one starts again."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -269,16 +280,28 @@ class ReplanArguments(BenchArguments):
 
 @dataclass(frozen=True, kw_only=True)
 class EnvArguments(BenchArguments):
-    """Time the simulation: how much of MuJoCo's rate is left with the environment and a planner in the loop."""
+    """Time the simulation: the share of MuJoCo's own rate that remains with environment and planner."""
 
     benchmark = "env"
 
 
 @dataclass(frozen=True, kw_only=True)
 class KinematicsArguments(BenchArguments):
-    """Time kinematics beside other libraries'; a plot is put beside the figures."""
+    """Time kinematics and other libraries' for comparison; a plot is written beside the figures."""
 
     benchmark = "kinematics"
 
     compiled: bool = True
+    """Measure compiled forms too: they take minutes to compile."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class SeriesArguments(BenchArguments):
+    """Run every benchmark, into one file with versions, machine and commit."""
+
+    benchmark = "all"
+
+    seconds: float = 0.2
+    """Time spent on each figure of kinematics and re-plans [s]."""
+    compiled: bool = False
     """Measure compiled forms too: they take minutes to compile."""

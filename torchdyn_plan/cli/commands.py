@@ -12,7 +12,6 @@ from torchdyn_plan.cli.arguments import (
     BENCHMARKS,
     DATA,
     TRAINING,
-    Arguments,
     BenchArguments,
     CollectArguments,
     EpisodeArguments,
@@ -22,6 +21,7 @@ from torchdyn_plan.cli.arguments import (
     PolicyArguments,
     RecordArguments,
     ReplanArguments,
+    ReportArguments,
     SweepArguments,
     TrainArguments,
     ViewArguments,
@@ -37,8 +37,8 @@ if TYPE_CHECKING:
     from torchdyn_plan.view import Scenario
 
 
-def run(task: Task | None, arguments: Arguments) -> None:
-    """Run the command that takes these arguments; benchmarks may be given no task."""
+def run(task: Task | None, arguments: Any) -> None:
+    """Run the command that takes these arguments; benchmarks and reports may be given no task."""
     command = next(function for form, function in COMMANDS.items() if isinstance(arguments, form))
     command(task, arguments)
 
@@ -92,6 +92,16 @@ def sweep(task: Task, arguments: SweepArguments) -> None:
         **_shared(task, arguments),
     )
     say(format_table(task, rows))
+
+
+def report(task: Task | None, arguments: ReportArguments) -> None:
+    """Draw the figures of the task's paper, or of all tasks' papers, and say what there are no results of."""
+    from torchdyn_plan.evaluation.paper_figures import draw_report
+
+    found = draw_report(arguments.out, results=arguments.results, tasks=None if task is None else [task])
+    say(f"written: {', '.join(map(str, found.files))}")
+    if found.missing:
+        say("\n".join(["no results of ours, the paper's curve alone:", *found.missing]))
 
 
 def collect(task: Task, arguments: CollectArguments) -> None:
@@ -233,9 +243,10 @@ def _scenarios(task: Task, arguments: ViewArguments | RecordArguments) -> list[S
     return [Scenario(planner=name, **shared) for name in arguments.planners]
 
 
-COMMANDS: dict[type[Arguments], Callable[[Any, Any], None]] = {
+COMMANDS: dict[type[Any], Callable[[Any, Any], None]] = {
     EvaluateArguments: evaluate,
     SweepArguments: sweep,
+    ReportArguments: report,
     CollectArguments: collect,
     BenchArguments: bench,
     ViewArguments: view,

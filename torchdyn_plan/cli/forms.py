@@ -21,6 +21,8 @@ from torchdyn_plan.cli.arguments import (
     PolicyArguments,
     RecordArguments,
     ReplanArguments,
+    ReportArguments,
+    SeriesArguments,
     SweepArguments,
     TrackArguments,
     ViewArguments,
@@ -81,11 +83,12 @@ def task_of(words: Sequence[str]) -> tuple[str, str | None, list[str]]:
     return task, named["--scene"], others
 
 
-def command_forms(task: Task, named: str) -> dict[str, type[Arguments]]:
+def command_forms(task: Task, named: str) -> dict[str, type[Any]]:
     """The arguments of each command but ``train`` and ``bench`` for ``task``, which the words call ``named``."""
     return {
         "evaluate": _episode_form(EvaluateArguments, task, named),
         "sweep": _episode_form(SweepArguments, task, named, over=_over(task)),
+        "report": ReportArguments,
         "collect": _form(
             CollectArguments,
             **_task_options(task, named),
@@ -112,6 +115,7 @@ def bench_forms(task: Task, named: str) -> dict[str, type[Arguments]]:
         ),
         "env": _form(EnvArguments, **_task_options(task, named)),
         "kinematics": _form(KinematicsArguments, **_task_options(task, named)),
+        "all": _form(SeriesArguments, **_task_options(task, named)),
     }
 
 

@@ -1,4 +1,4 @@
-"""Simulated worlds as TorchRL environments; those of a task lie in its folder, and are imported when asked for."""
+"""Simulated worlds as TorchRL environments; each is imported on first use."""
 
 from __future__ import annotations
 

@@ -15,7 +15,7 @@ SPLITS = {"test": 0, "dev": 1, "train": 2}
 
 
 def somewhere() -> int:
-    """Number of an episode somewhere in a series, another at every call, with a million numbers of its own after it."""
+    """Number of an episode far into a series, different at every call, with a million unused numbers after it."""
     return secrets.randbits(30) << 20
 
 

@@ -69,7 +69,7 @@ class _Gym:
         return np.asarray(seen[self.world.flags[0]].squeeze(-1))
 
     def _spaces(self) -> tuple[Space[Any], Space[Any]]:
-        """What one environment shows, and what it is told."""
+        """Observation and action spaces of one environment."""
         shown = self.form.show(self.world.observation_spec.zero())
         single: Space[Any] = (
             Box(-np.inf, np.inf, tuple(shown.shape[1:]))

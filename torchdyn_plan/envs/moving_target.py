@@ -1,4 +1,4 @@
-"""What all tasks of meeting a moving target share as TorchRL environments: numbered episodes, keys, the history."""
+"""Base class of TorchRL environments with a moving target: numbered episodes, keys, the target's history."""
 
 from __future__ import annotations
 
@@ -26,22 +26,22 @@ if TYPE_CHECKING:
     from torchdyn_plan.envs.look import Look
 
 ENDS = ("done", "terminated", "truncated")
-"""Keys that tell whether an episode has ended."""
+"""Keys that mark the end of an episode."""
 
 
 RENDER_MODES = ("rgb_array",)
-"""What `MovingTargetEnv.render` can make."""
+"""Modes of `MovingTargetEnv.render`."""
 ON_BAD_ACTION = ("raise", "hold")
-"""What becomes of an action that is no number: an error before anything moves, or 0 in its row."""
+"""Treatment of a NaN or infinite action: an error before anything moves, or 0 in its row."""
 
 
 class RobotReading(NamedTuple):
-    """What N robots' sensors read, float32; the environment shows copies of these tensors."""
+    """Readings of N robots' sensors, float32; the environment returns copies of these tensors."""
 
     tool_pos: Tensor
     """``(N, D)`` [m, world]."""
     state: Tensor
-    """``(N, S)``: what a policy and an arrival model read, the tool's place among it."""
+    """``(N, S)``: input of policies and arrival models; includes the tool's position."""
     joint_pos: Tensor | None = None
     """``(N, joints)`` [rad]; None for a robot without joints."""
     joint_vel: Tensor | None = None
@@ -58,12 +58,12 @@ class MovingTargetEnv(EnvBase):
     next index when they reset, so that the same actions give bit-identical episodes whatever ``num_envs``.
 
     Actions are detached, and no tensor that is returned shares memory with the environment or with another entry: it
-    may be changed in place. `state_dict` holds where the series stands; an environment that loads it starts the
-    interrupted episodes again at its next reset, and goes on from there.
+    may be changed in place. `state_dict` stores the position in the series; an environment that loads it restarts
+    the interrupted episodes at its next reset and continues from there.
     """
 
     flags: ClassVar[tuple[str, ...]] = ()
-    """Keys of what the task tells beside, bool ``(N, 1)`` each; the first one is success."""
+    """Keys of the task's flags, bool ``(N, 1)`` each; the first one is success."""
     scene_digest: str | None = None
     """Hash of the scene, which a planner that was made for one must share; None if there is nothing to confuse."""
 
@@ -403,7 +403,7 @@ class MovingTargetEnv(EnvBase):
         return tensordict, TensorDict(entries, batch_size=self.batch_size, device=self.device)
 
     def _observe(self) -> dict[str, Tensor]:
-        """What is seen now, on the CPU; every entry has a memory of its own."""
+        """The present observation, on the CPU; no entry shares memory with another."""
         robot, history = self._robot(), (self._trace if self._sensing is None else self._held_trace).clone()
         target = history[:, -1].clone()
         observation = [robot.state]

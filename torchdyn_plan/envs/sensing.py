@@ -32,7 +32,7 @@ class Sensed(NamedTuple):
 
 
 class Sensing:
-    """The sensors of N environments: what has been measured, and what is still on its way.
+    """The sensors of N environments, with measurements that have not arrived yet.
 
     All that is random of an episode's measurements is drawn when it starts, as a pure function of (split, seed,
     episode): results do not depend on how many environments there are.

@@ -1,4 +1,4 @@
-"""What a camera does to the place of a target, in six numbers. Nothing heavy is imported here."""
+"""A sensor model of the target's position in six numbers. Imports nothing heavy."""
 
 from __future__ import annotations
 
@@ -12,10 +12,10 @@ LOWEST_RATE, HIGHEST_RATE = 1.0, 10_000.0
 
 @dataclass(frozen=True, kw_only=True)
 class Sensor:
-    """How an environment's target is measured; by default exactly, at every control step, at once.
+    """How an environment measures its target; by default exactly, at every control step, without delay.
 
-    Measurement n is taken about n / ``rate`` seconds after the reset, and is seen ``latency`` seconds later. The first
-    one is there at the reset, and never lost.
+    Measurement n is taken about n / ``rate`` seconds after the reset, and arrives ``latency`` seconds later. The first
+    one is available at the reset and never lost.
     """
 
     rate: float | None = None
@@ -23,13 +23,13 @@ class Sensor:
     noise: float = 0.0
     """Standard deviation of a measurement's error along each axis [m]."""
     latency: float = 0.0
-    """Time from when a measurement is taken to when it is seen [s]."""
+    """Time from a measurement to its arrival [s]."""
     jitter: float = 0.0
-    """Standard deviation of the moment at which a measurement is taken about the regular one [s]."""
+    """Standard deviation of the time at which a measurement is taken [s]."""
     dropout: float = 0.0
     """Share of the measurements that are lost."""
     quantisation: float = 0.0
-    """Measurements are whole multiples of this along each axis [m]; 0 for any number."""
+    """Measurements are rounded to multiples of this along each axis [m]; 0 for no rounding."""
 
     def __post_init__(self) -> None:
         from torchdyn_plan.checks import check_number
@@ -47,12 +47,12 @@ class Sensor:
 
     @property
     def deviation(self) -> float:
-        """Standard deviation of what is measured along each axis, that of rounding to whole grains included [m]."""
-        # What is rounded is off by anything up to half a grain, alike.
+        """Standard deviation of a measurement along each axis, including quantisation [m]."""
+        # The error of rounding is uniform within half a step.
         return math.hypot(self.noise, self.quantisation / math.sqrt(12.0))
 
     def slots(self, control_step: float) -> int:
-        """Measurements that can come within a control step [s]; of more, as jitter may bring, the first are lost."""
+        """Measurements that can arrive in a control step [s]; if jitter brings more, the first ones are lost."""
         regular = math.ceil(control_step * (self.rate or 1.0 / control_step) - 1e-9)
         return max(regular, 1) + (3 if self.jitter else 0)
 

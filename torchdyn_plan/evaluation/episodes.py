@@ -25,7 +25,7 @@ Planner = Callable[[TensorDictBase], TensorDictBase]
 OFF_PATH = 0.002
 """A target this far off its path was touched [m]."""
 RENEWED_EVERY = 5
-"""The future of a target that is being touched is simulated anew every so many control steps."""
+"""Control steps after which the future of a target that is being touched is simulated again."""
 
 
 @dataclass(kw_only=True)
@@ -119,7 +119,7 @@ class ShownTruth:
     """What planners that know the truth are shown of it: recordings, and how things go on from the present state."""
 
     def __init__(self, planner: Planner, env: MovingTargetEnv, recorded: Tensor | None) -> None:
-        """Show ``planner`` in ``env`` what it reads of the truth, by ``recorded`` (E, T, D) paths; nothing for none."""
+        """Write the true paths that ``planner`` reads into ``env``, from ``recorded`` (E, T, D); nothing for None."""
         read = getattr(planner, "in_keys", ())
         known = recorded if recorded is not None and recorded.shape[1] else None
         self.env, self.recorded = env, known

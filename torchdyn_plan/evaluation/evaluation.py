@@ -41,7 +41,7 @@ class Evaluation:
 
         Args:
             folder: may hold the same evaluation already.
-            overwrite: take the place of whatever other results are there.
+            overwrite: replace other results in it.
 
         Raises:
             InputError: the folder holds a sweep, or results of something else.
@@ -75,27 +75,27 @@ def evaluate(
     progress: bool = True,
     **settings: Any,
 ) -> Evaluation:
-    """Let each planner play the same episodes, 0 to E-1.
+    """Run the same episodes, 0 to E-1, with each planner.
 
     Args:
         task: a task, or its name as `load_task` takes it.
-        planners: any planners by name, or names of the task's own; those that run by default for None.
+        planners: planners by name, or names of the task's planners; its default ones for None.
         static: name of the task's static planner: named planners are built on it, and it decides which episodes count
             as solvable; the task's default one for None.
         episodes: number E of episodes for each planner.
-        seed: which series of episodes.
-        split: which family of series: ``test``, or ``dev`` for tuning.
-        num_envs: episodes that run side by side; does not change the results of the task's own planners.
+        seed: series of episodes.
+        split: ``test``, or ``dev`` for tuning.
+        num_envs: episodes simulated at once; does not change the results of the task's planners.
         num_threads: of the simulation, 0 for all cores; does not change the results.
-        delivery: how plans come into use, `torchdyn_plan.planners.Delayed` for one; planners that make no plans have
+        delivery: when plans become available, e.g. `torchdyn_plan.planners.Delayed`; planners that make no plans have
             none.
-        sensor: how targets are measured; exactly for None.
-        track: what becomes of the measurements before planners see them, `torchdyn_plan.planners.KalmanTrack` for one;
-            planners see the newest one, held from step to step, for None.
-        weights: folder of the networks of named planners, as ``train`` leaves it; those that ship for None.
-        other_scene: let planners of another scene play, too.
-        out: folder in which the results are saved as soon as they are there; it is looked at before anything runs.
-        overwrite: take the place of whatever other results are in that folder.
+        sensor: sensor model of the target; exact for None.
+        track: filter between sensor and planners, e.g. `torchdyn_plan.planners.KalmanTrack`; for None planners see the
+            newest measurement, held from step to step.
+        weights: folder of the networks of named planners, as ``train`` writes it; the shipped ones for None.
+        other_scene: allow planners that belong to another scene.
+        out: folder for the results; it is checked before anything runs.
+        overwrite: replace other results in that folder.
         progress: show progress bars.
         settings: of the task, by name; the others are at their defaults.
 
@@ -134,7 +134,7 @@ def evaluate(
         try:
             found.save(out, overwrite=overwrite)
         except OutputError as error:
-            # What cannot be saved is told at least.
+            # If it cannot be saved, it is at least printed.
             error.add_note(found.table())
             raise
     return found

@@ -36,7 +36,7 @@ def identity_of(config: Mapping[str, Any], version: str | None = None) -> dict[s
     installed one for None.
     """
     decides = {name: value for name, value in config.items() if name not in FREE}
-    # Each setting has a line of its own, to be named where it differs, and so have each planner's weights.
+    # One line for each setting and for each planner's weights, so that an error can name the one that differs.
     for name in ("settings", "weights"):
         parts = decides.pop(name, {})
         prefix = "weights of " if name == "weights" else ""

@@ -1,4 +1,4 @@
-"""Figures of results, beside the paper's. matplotlib is imported where a figure is drawn."""
+"""Figures of results with the paper's for comparison. matplotlib is imported where a figure is drawn."""
 
 from __future__ import annotations
 
@@ -110,7 +110,7 @@ def plot_sweep(task: Task, rows: Sequence[ResultRow], over: str, path: Path) -> 
         for planner in planners:
             _draw_curve(axes, [row for row in rows if row.planner == planner], over, panel, styles[planner])
         _draw_paper(axes, task, rows[0], over, panel)
-        axes.set(title=panel.title, ylim=(0, 1.02), xlabel=_axis(task, over))
+        axes.set(title=panel.title, ylim=(0, 1.02), xlabel=axis_label(task, over))
         axes.grid(alpha=0.3)
     all_axes[0].set_ylabel("success rate")
     handles, labels = all_axes[0].get_legend_handles_labels()
@@ -166,14 +166,15 @@ def _panels_of(task: Task) -> list[_Panel]:
 
 
 def _styles(task: Task, planners: Iterable[str]) -> dict[str, Style]:
-    """The style of each planner of ``task``, and of those beside them."""
+    """The style of each planner of ``task``, and of others."""
     names = dict.fromkeys([*task.planners, *planners])
     others = [name for name in names if name not in STYLES]
     further = {name: FURTHER_STYLES[index % len(FURTHER_STYLES)] for index, name in enumerate(others)}
     return {name: STYLES.get(name) or further[name] for name in names}
 
 
-def _axis(task: Task, over: str) -> str:
+def axis_label(task: Task, over: str) -> str:
+    """What stands along the axis of a setting, with its unit."""
     text = next(one.metadata.get("text", one.name) for one in fields(task.settings) if one.name == over)
     return f"{text} [{unit_of(task, over)}]" if unit_of(task, over) else text
 

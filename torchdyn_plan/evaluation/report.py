@@ -1,4 +1,4 @@
-"""Results as one table for the eye."""
+"""Results as a table of text."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ class Column(NamedTuple):
 
 
 def format_table(task: Task, rows: Sequence[ResultRow]) -> str:
-    """One aligned table of text: a line a row, rates in per cent, the paper's figure beside ours, ``–`` for none."""
+    """An aligned table of text: one line per row, rates in per cent, the paper's figure after ours, ``–`` for none."""
     varying = _varying(rows)
     columns = [*_names(rows, varying), *_rates(task, rows), *_causes(task, rows), *_measures(rows), *_track(rows)]
     lines = [[column.head for column in columns], *([column.cell(row) for column in columns] for row in rows)]
@@ -41,7 +41,7 @@ def unit_of(task: Task, name: str) -> str:
 
 
 def plain(value: Any) -> str:
-    """A value for the eye."""
+    """A value as it is shown."""
     return f"{value:g}" if isinstance(value, (int, float)) and not isinstance(value, bool) else str(value)
 
 
@@ -51,7 +51,7 @@ def _varying(rows: Sequence[ResultRow]) -> list[str]:
 
 
 def _names(rows: Sequence[ResultRow], varying: Sequence[str]) -> Iterator[Column]:
-    """What tells the rows apart."""
+    """Columns that identify a row."""
     yield Column("planner", lambda row: row.planner)
     if len({row.static for row in rows}) > 1:
         yield Column("static", lambda row: row.static)
@@ -87,7 +87,7 @@ def _measures(rows: Sequence[ResultRow]) -> Iterator[Column]:
 
 
 def _track(rows: Sequence[ResultRow]) -> Iterator[Column]:
-    """What tracks made of measurements."""
+    """Counts of the measurements that tracks used, rejected, or restarted at."""
     for name in dict.fromkeys(name for row in rows for name in row.track):
         yield Column(f"track {name}", lambda row, name=name: _number(row.track.get(name), 1))
 

@@ -1,4 +1,4 @@
-"""From episodes to numbers: outcomes, their summary, and the files that hold them."""
+"""Outcomes of episodes, their summary, and the files that store them."""
 
 from __future__ import annotations
 
@@ -36,15 +36,15 @@ class EpisodeOutcomes:
     steps: Tensor
     """Control steps until the success, -1 for none, int64."""
     replans: Tensor
-    """How often the planner planned, int64."""
+    """Number of plans, int64."""
     solvable: Tensor
     """The episode can be solved at all, by the task's notion of it, bool."""
     flags: Mapping[str, Tensor] = field(default_factory=dict)
     """Further outcomes of the task, bool, by name."""
     evidence: Mapping[str, Tensor] = field(default_factory=dict)
-    """What the causes follow from, and what a track counted, by name."""
+    """Measurements from which the causes follow, and counts of the track, by name."""
     cause: Tensor
-    """Index into ``causes`` of what the episode failed of, int64; `NO_CAUSE` for none."""
+    """Index into ``causes`` of the cause of failure, int64; `NO_CAUSE` for none."""
     causes: tuple[str, ...] = ()
     """Names of the causes of failure."""
     seconds: float
@@ -251,7 +251,7 @@ def over_repeats(row: ResultRow, repeats: Sequence[EpisodeOutcomes]) -> ResultRo
         return statistics.mean(rates), statistics.stdev(rates)
 
     everything = [float(one.success.double().mean()) for one in repeats]
-    # Without a solvable episode the mean is no number.
+    # Without a solvable episode the mean is NaN.
     possible = [float(one.success[one.solvable].double().mean()) for one in repeats]
     return dataclasses.replace(
         row,

@@ -1,4 +1,4 @@
-"""Planners, and the episodes that all of them are to play: what an evaluation and a sweep have in common."""
+"""Planners and the episodes that they all run: what an evaluation and a sweep have in common."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ Planners = Mapping[str, Planner] | Sequence[str]
 
 @dataclass(frozen=True, kw_only=True)
 class Study:
-    """Planners by name, and how many episodes of which kind each of them plays."""
+    """Planners by name, and the number and kind of episodes that each runs."""
 
     task: Task
     planners: Mapping[str, Planner]
@@ -44,7 +44,7 @@ class Study:
     sensor: Sensor | None = None
     """How targets are measured; exactly for None."""
     track: Track | None = None
-    """What becomes of the measurements before planners see them; they see the newest one, held, for None."""
+    """Filter between sensor and planners; for None they see the newest measurement, held."""
     progress: bool = True
 
     def __post_init__(self) -> None:
@@ -159,7 +159,7 @@ def _tracked(name: str, planner: Planner, track: Track, task: Task) -> TrackedPl
 
 
 def _delivered(planner: Planner, delivery: Delivery) -> Planner:
-    """The same planner whose plans come by ``delivery``; one that makes no plans as it is."""
+    """The same planner with ``delivery``; a planner that makes no plans is returned unchanged."""
     if isinstance(planner, TrackedPlanner):
         return planner.with_planner(_delivered(planner.planner, delivery))
     return planner.with_parts(delivery=delivery) if isinstance(planner, DynamicPlanner) else planner

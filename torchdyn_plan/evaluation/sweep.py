@@ -33,11 +33,11 @@ class Point(TypedDict):
     """One value and repeat in a file."""
 
     identity: str
-    """Digest of what it is of."""
+    """Digest of the sweep and the point."""
     content: str
     """Digest of the planners' outcomes: a file that was damaged does not have it."""
     planners: dict[str, dict[str, Any]]
-    """How each planner's episodes ended."""
+    """Outcomes of each planner's episodes."""
 
 
 def sweep(
@@ -65,7 +65,7 @@ def sweep(
 ) -> list[ResultRow]:
     """Evaluate planners along the values of a setting, and write ``results.json`` and ``sweep.png``.
 
-    Points that lie in the folder are not run again.
+    Points that the folder already holds are not run again.
 
     Args:
         task: a task, or its name as `load_task` takes it.
@@ -77,15 +77,15 @@ def sweep(
         static: as of `evaluate`, like all further arguments.
         episodes: number of episodes for each planner, value and repeat.
         seed: the first series of episodes.
-        split: which family of series.
-        num_envs: episodes that run side by side.
+        split: ``test`` or ``dev``.
+        num_envs: episodes simulated at once.
         num_threads: of the simulation, 0 for all cores.
-        delivery: how plans come into use.
-        sensor: how targets are measured.
-        track: what becomes of the measurements.
+        delivery: when plans become available.
+        sensor: sensor model of the target.
+        track: filter between sensor and planner.
         weights: folder of the networks of named planners.
-        other_scene: let planners of another scene play, too.
-        overwrite: remove whatever results are in the folder, points of this sweep among them.
+        other_scene: allow planners that belong to another scene.
+        overwrite: remove all results in the folder, including points of this sweep.
         progress: show progress bars.
         settings: of the task, by name, but for the one that varies.
 

@@ -93,7 +93,7 @@ def _shown(observed: TensorDictBase) -> list[Tensor]:
 
 
 def true_target(tensordict: TensorDictBase) -> Tensor:
-    """Where targets are, ``(*B, D)`` [m, world], whatever a sensor makes of it."""
+    """Where targets are, ``(*B, D)`` [m, world], unaffected by the sensor."""
     truth = tensordict.get(keys.TRUE_TARGET_POS, None)
     return tensordict[keys.TARGET_POS] if truth is None else truth
 

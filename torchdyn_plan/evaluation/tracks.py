@@ -1,4 +1,4 @@
-"""Tracks by name, as a person chooses them beside a sensor."""
+"""Tracks by name, as the command line selects them."""
 
 from __future__ import annotations
 

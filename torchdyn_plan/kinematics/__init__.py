@@ -1,4 +1,4 @@
-"""Arms as batched torch: pose and Jacobian in closed form, damped least squares, and inverse kinematics by it."""
+"""Arms as batched PyTorch: pose and Jacobian in closed form, damped least squares, inverse kinematics."""
 
 from torchdyn_plan.kinematics.arm import Arm
 from torchdyn_plan.kinematics.branches import Branches, branches

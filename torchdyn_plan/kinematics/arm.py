@@ -33,12 +33,12 @@ class Arm(Precise):
 
     It computes in float32 or float64; ``half()`` leaves it in float32.
     The buffers ``lower``, ``upper`` (N,) [rad; m] and ``speed_limit`` (N,) [rad/s; m/s] hold the joints' limits; a
-    speed limit that a description does not give is infinite, and `needed_speed_limit` is what to ask for it.
+    speed limit missing in the description is infinite; `needed_speed_limit` raises if it is.
 
     Where one joint of the chain moves with another, at ratio · q + shift (`Coupling`), the arm has one position for
     both, named after the joint that moves the other, with limits that hold for both.
 
-    ``joint_names``, ``joint_kinds`` and ``full_turns`` (whether a full turn leaves the pose as it is) tell of the N
+    ``joint_names``, ``joint_kinds`` and ``full_turns`` (whether a full turn leaves the pose as it is) describe the N
     positions.
 
     ``form`` says how the arm is evaluated; all forms are exact, and the attribute of that name does the work:
@@ -49,7 +49,7 @@ class Arm(Precise):
     - ``"transforms"``: the product of a few transforms, each of some neighbouring joints and itself made of sines.
     - ``"auto"`` (default): sines, unless there would be more than `forms.MOST_SINES` of them or there cannot be any.
 
-    ``components`` is the same once more as code for a compiler, see `ComponentForm`.
+    ``components`` is the same in a form for compilers, see `ComponentForm`.
     """
 
     lower: Tensor
@@ -72,8 +72,8 @@ class Arm(Precise):
 
         Args:
             joints: base to tip.
-            tool: ``(4, 4)``, pose of the tool in the frame behind the last joint [m]; that frame itself by default.
-            speed_limit: replaces the joints' own, one for all or one for each [rad/s; m/s].
+            tool: ``(4, 4)``, pose of the tool in the frame after the last joint [m]; identity by default.
+            speed_limit: replaces the joints' limits, one for all or one for each [rad/s; m/s].
             form: see above.
             dtype: torch.float32 or torch.float64.
             device: CPU by default.

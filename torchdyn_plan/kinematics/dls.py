@@ -91,7 +91,7 @@ def dls_step_within(  # noqa: PLR0917  # As of `dls_step`, and the limits.
 ) -> Tensor:
     """`dls_step` for rows ``(M, …)``, by the joints that may move.
 
-    A joint at its limit that would be pushed out is left out, and the step solved anew for its row: so the others do
+    A joint at its limit that would be pushed out is removed, and the step of its row is solved again: the others do
     the whole of the work, not what such a joint leaves to them.
 
     Args:

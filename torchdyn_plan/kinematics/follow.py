@@ -79,7 +79,7 @@ def follow(
 
     Returns:
         As of `solve_ik`, with the time before the last dimensions: ``q`` (*B, T, N), ``status`` (*B, T), and
-        ``residual`` (*B, T, 2). At a pose that is not one the joints stay; the row goes on after it.
+        ``residual`` (*B, T, 2). At an invalid pose the joints stay; the row continues after it.
 
     Raises:
         InputError: a shape, device, precision, name or number is wrong.

@@ -43,7 +43,7 @@ class SineForm(Precise):
     def __init__(self, form: TrigonometricForm) -> None:
         """Lay the entries of ``form`` out as a pose ``(4, 4)`` and a Jacobian ``(6, N)``.
 
-        Each has a product of its own: two small ones take less time than cutting the result of one.
+        Two small matrix products take less time than splitting the result of one.
         """
         super().__init__()
         self.num_joints = len(form.frequencies)

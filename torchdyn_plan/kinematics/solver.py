@@ -47,14 +47,14 @@ class IKStatus(IntEnum):
 
 
 class IKResult(NamedTuple):
-    """What `solve_ik` found; with ``solutions=k`` each has a dimension of ``k`` after the batch's."""
+    """Result of `solve_ik`; with ``solutions=k`` each entry has a dimension ``k`` after the batch."""
 
     q: Tensor
     """``(*B, N)`` [rad; m]; the nearest that was found where the row is not solved, the start where it is invalid."""
     status: Tensor
     """``(*B,)``, integers of `IKStatus`."""
     residual: Tensor
-    """``(*B, 2)``, distance of place [m] and of direction [rad] from the target; infinite where the row is invalid."""
+    """``(*B, 2)``, errors of position [m] and orientation [rad]; infinite where the row is invalid."""
 
 
 class _Pool(NamedTuple):
@@ -91,22 +91,22 @@ def solve_ik(
 ) -> IKResult:
     """Joint positions at which the tool is at ``target``, by damped least squares with restarts.
 
-    A row is never disturbed by another: bad rows are told by their status, and a row alone has the same answer as in
-    a batch. The starts after the first are the same for every row. Whole poses of arms of the UR family are solved by
+    Rows are independent: bad rows are marked by their status, and a row alone has the same solution as in a batch.
+    The starts after the first are the same for every row. Whole poses of arms of the UR family are solved by
     `branches` first, unless ``rounds`` is one alone. Joints are turned by 2π towards the start as far as their limits
-    allow, and of the solutions found that is taken which all joints reach soonest at their speed limits (where an arm
-    does not have them all, that with the least turn).
+    allow, and the solution that all joints reach soonest at their speed limits is taken (if the arm lacks some limits,
+    the one with the least rotation).
 
     With ``solutions=k`` a row has up to ``k`` of them that differ, the nearest first. Those that were not found have a
     status other than `SOLVED` and are copies of the first, with infinite residuals. All starts of a round then go to
     their ends, and further rounds are made until there are ``k``; an arm of the UR family has 8 at most, all known.
 
     Args:
-        arm: whose tool it is.
-        target: ``(*B, 4, 4)``, base frame [m]; ``(*B, 3)`` will do for the constraint "position".
-        q0: start of the first round, ``(*B, N)`` or ``(N,)``; a fixed one by default. Outside the limits it is brought
-            inside.
-        constraint: "pose", "axis" (place, and direction of the tool's z axis: yaw is free) or "position".
+        arm: the arm.
+        target: ``(*B, 4, 4)``, base frame [m]; or ``(*B, 3)`` for the constraint "position".
+        q0: start of the first round, ``(*B, N)`` or ``(N,)``; a fixed one by default. It is clamped to
+            the limits.
+        constraint: "pose", "axis" (position and direction of the tool's z axis; yaw is free) or "position".
         symmetry: for the constraint "pose", the tool is the same after one ``symmetry``-th of a turn about its z axis.
         position_tolerance: [m]
         rotation_tolerance: [rad]
@@ -114,9 +114,9 @@ def solve_ik(
         rounds: number of starts, side by side, in each round; rows solved in one do not enter the next.
         max_step: most that any joint moves in one step, a number or ``(N,)`` [rad; m].
         max_move: most that any joint may be away from ``q0`` at the end, a number or ``(N,)`` [rad; m].
-        posture: ``(*B, N)`` or ``(N,)``, to which the motion that the constraint leaves free is drawn.
-        solutions: how many are wanted of each row; ``q`` is then ``(*B, k, N)``, and the others likewise.
-        differentiable: give ``q`` derivatives in ``target`` and the arm's own tensors, see `implicit.refine`.
+        posture: ``(*B, N)`` or ``(N,)``, preferred joint positions for the freedom that the constraint leaves.
+        solutions: number of solutions per row; ``q`` is then ``(*B, k, N)``, and the others likewise.
+        differentiable: give ``q`` gradients with respect to ``target`` and the arm's tensors, see `implicit.refine`.
 
     Raises:
         InputError: a shape, device, precision, name or number is wrong.

@@ -2,7 +2,7 @@
 
 Every entry of the forward kinematics of a revolute chain is a polynomial in cos qᵢ and sin qᵢ, hence a finite Fourier
 series in integer combinations of the joint angles. Multiplying the chain's transforms as such series is exact (no
-fit), and each joint adds a frequency of its own, so that terms never collide; what remains at run time is
+fit), and each joint adds a different frequency, so that terms never collide; what remains at run time is
 ``c + sin(q·C + b) · W``. Prismatic joints before the first revolute one shift the place alone and add ``q · L``; a
 prismatic joint after a revolute one multiplies sines by q and has no such form.
 """

@@ -1,4 +1,4 @@
-"""Networks: where the target will be, how sure that is, when the robot can be there, and a policy to take it there."""
+"""Models: forecasts with their uncertainty, arrival times of a robot, and policies that move it."""
 
 from torchdyn_plan.nets.analytic import Ballistic, Billiard, ConstantVelocity
 from torchdyn_plan.nets.analytic_arrival import AnalyticArrival, GoalJoints, SolvedJoints

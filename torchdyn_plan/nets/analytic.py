@@ -1,4 +1,4 @@
-"""Forecasts from mechanics alone: nothing is trained. In place of a forecaster wherever one is asked for."""
+"""Forecasts by mechanics, without training; usable wherever a forecaster is expected."""
 
 from __future__ import annotations
 
@@ -104,7 +104,7 @@ class AnalyticForecast(ForecastModel):
 
 
 class ConstantVelocity(AnalyticForecast):
-    """The target goes on as it does."""
+    """The target keeps its velocity."""
 
     def follow(self, history: Tensor, velocity: Tensor, time: Tensor, deviation: Tensor) -> Forecast:
         """As of `AnalyticForecast`."""

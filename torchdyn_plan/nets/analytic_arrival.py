@@ -1,4 +1,4 @@
-"""When an arm can be somewhere, from the limits of its joints alone: nothing is trained, and nothing simulated."""
+"""Arrival times of an arm from the limits of its joints, without training or simulation."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ class GoalJoints(Protocol):
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class SolvedJoints:
-    """Joints by `solve_ik`: of all solutions that are found the one that is reached soonest."""
+    """Joints by `solve_ik`: of all solutions found, the one that is reached soonest."""
 
     arm: Arm
     """Whose tool is at the goal."""

@@ -1,4 +1,4 @@
-"""What a model looks like that tells when, and whether, a robot arrives."""
+"""Interface of models that predict when, and whether, a robot arrives."""
 
 from __future__ import annotations
 
@@ -24,13 +24,13 @@ class ArrivalQuery(Protocol):
 
 
 class ArrivalModel(nn.Module, ABC):
-    """Tells how long a static planner takes to a goal; `torchdyn_plan.nets.ETANetwork` is one."""
+    """Predicts how long a static planner needs to a goal; `torchdyn_plan.nets.ETANetwork` is one."""
 
     @abstractmethod
     def arrival(self, robot_state: Tensor, goal: Tensor, *, estimator: str = "mode") -> Arrival:
         """Arrival ``(*B, K)`` at goals (*B, K, D) [m, world] from robot states (*B, 1, S).
 
-        ``estimator`` says how a distribution over time becomes one number; a model that knows the time ignores it.
+        ``estimator`` selects how a distribution over time is reduced to one number; a deterministic model ignores it.
         """
 
     def from_state(self, robot_state: Tensor) -> ArrivalQuery:
@@ -43,10 +43,10 @@ class ArrivalModel(nn.Module, ABC):
 
 
 class FunctionArrival(ArrivalModel):
-    """A person's own function as an arrival model."""
+    """A function as an arrival model."""
 
     def __init__(self, function: Callable[[Tensor, Tensor], Any]) -> None:
-        """Wrap ``function``: robot states (*B, 1, S) and goals (*B, K, D) to an `Arrival`, or to the steps alone."""
+        """Wrap ``function``, from robot states (*B, 1, S) and goals (*B, K, D) to an `Arrival` or to steps."""
         super().__init__()
         self.function = function
 

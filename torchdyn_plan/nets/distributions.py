@@ -1,4 +1,4 @@
-"""What networks say of the future, with how sure they are: when a robot arrives, and how far a forecast may be off."""
+"""Predicted distributions: arrival times of a robot, and errors of a forecast."""
 
 from __future__ import annotations
 
@@ -95,7 +95,7 @@ def decode_mode(logits: Tensor, *, bin_width: int = 5) -> Arrival:
         bin_width: control steps in a bin.
 
     Returns:
-        `Arrival` of ``(*B,)``; ``never`` where the last class is the likeliest, with the likeliest bin all the same.
+        `Arrival` of ``(*B,)``; ``never`` where the last class is the likeliest, with the likeliest bin even so.
     """
     bins, logits = logits.shape[-1] - 1, logits if logits.dtype in EXACT else logits.float()
     never = logits.argmax(dim=-1) == bins
@@ -109,7 +109,7 @@ def decode_distribution(logits: Tensor, *, bin_width: int = 5, moments: Tensor |
     Args:
         logits: ``(*B, bins + 1)``, the last for *never arrives*.
         bin_width: control steps in a bin.
-        moments: `arrival_moments` of the same bins, for whoever has them at hand.
+        moments: `arrival_moments` of the same bins, if already computed.
 
     Returns:
         `Arrival` of ``(*B,)``; ``never`` where *never* is likelier than all bins together.

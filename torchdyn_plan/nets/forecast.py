@@ -1,4 +1,4 @@
-"""Where the target is expected, how sure that is, and what a model that tells so looks like."""
+"""Forecasts of a target's path with their uncertainty, and the interface of models that make them."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ class Forecast(NamedTuple):
     path: Tensor
     """``(*B, F, D)`` [m, world]: entry e-1 is the position in e control steps."""
     spread: Spread | None = None
-    """How far the path may be off; None where nobody says."""
+    """Distribution of the path's error; None if the model has none."""
 
     def after(self, steps: int) -> Forecast:
         """The forecast counted from ``steps`` control steps later; raises `InputError` if it does not reach so far."""
@@ -61,7 +61,7 @@ class ForecastModel(nn.Module, ABC):
 
 
 class FunctionForecast(ForecastModel):
-    """A person's own function as a forecast model."""
+    """A function as a forecast model."""
 
     def __init__(self, function: Callable[..., Any], *, in_keys: Sequence[Any] = (keys.TARGET_HISTORY,)) -> None:
         """Wrap ``function`` (an `nn.Module` too): the entries ``in_keys`` to a path (*B, F, D) or a `Forecast`."""
@@ -84,7 +84,7 @@ class FunctionForecast(ForecastModel):
 
 
 class DescribedForecast(ForecastModel):
-    """A forecast model that also tells what it saw, from which its errors can be judged."""
+    """A forecast model that also returns its features, from which the spread of its errors is predicted."""
 
     @abstractmethod
     def forward(self, target_history: Tensor, target_covariance: Tensor | None = None) -> Tensor:

@@ -24,7 +24,7 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True, kw_only=True)
 class ForecasterConfig:
-    """Sizes of a `Forecaster` and what it knows about the space that the target moves in."""
+    """Sizes of a `Forecaster`, and its prior knowledge of the space in which the target moves."""
 
     history: int = 24
     """Positions H that it sees, the newest included."""

@@ -1,4 +1,4 @@
-"""When a point with limits of speed and acceleration can be somewhere: nothing is trained, and nothing simulated."""
+"""Arrival times of a point with limits on speed and acceleration, without training or simulation."""
 
 from __future__ import annotations
 

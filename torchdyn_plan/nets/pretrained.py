@@ -28,7 +28,7 @@ class Pretrained:
     config: Any
 
     def save_pretrained(self, path: str | Path) -> Path:
-        """Write weights and configuration to one file, whole or not at all; numbers as float32, whatever the network's.
+        """Write weights and configuration to one file, atomically; weights are written as float32.
 
         Args:
             path: a ``.safetensors`` file, or a folder, which gets ``<kind>.safetensors``.

@@ -1,4 +1,4 @@
-"""Planners: for a static goal, for a moving target, and the baselines; each takes and returns a tensordict."""
+"""Planners for static goals and moving targets, and baselines; each takes and returns a tensordict."""
 
 from torchdyn_plan.planners.background import Background, measured_latency
 from torchdyn_plan.planners.baselines import (

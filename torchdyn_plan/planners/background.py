@@ -31,7 +31,7 @@ class Order(NamedTuple):
 
 
 class Background:
-    """Makes plans in a thread while the control loop goes on: a planner's ``delivery``.
+    """Makes plans in a thread while the control loop continues: a planner's ``delivery``.
 
     A plan comes into use ``latency`` control steps after it was ordered, the moment for which it was made. One that is
     not ready then comes into use when it is, as old as it is; one that is not ready by the ``deadline`` never does, and
@@ -47,7 +47,7 @@ class Background:
         Args:
             latency: control steps from seeing to acting on it, as `measured_latency` finds them.
             deadline: control steps, at least ``latency``.
-            executor: runs the jobs one after the other; a thread of its own by default.
+            executor: runs the jobs one after the other; a new thread by default.
         """
         check_number("latency", latency, minimum=0, integer=True)
         check_number("deadline", deadline, minimum=latency, integer=True)
@@ -69,7 +69,7 @@ class Background:
         self.executor.shutdown()
 
     def drop(self) -> None:
-        """Forget the plan under way, once it is made: for a loop that begins anew, or is looked at out of its order."""
+        """Discard the plan that is being made: for a loop that restarts, or is evaluated out of order."""
         order, self._order = self._order, None
         if order is not None:
             wait([order.made])

@@ -23,14 +23,14 @@ from torchdyn_plan.planners.turn import Turn
 
 
 class TargetPursuit(Remembering):
-    """Runs after the target: at every step the goal is where the target is now (paper, Section IV-A.1)."""
+    """Pursuit: at every step the goal is the target's present position (paper, Section IV-A.1)."""
 
     def __init__(self, static: StaticPlanner, *, turn: Turn | None = None, scene: str | None = None) -> None:
-        """Run with ``static``, a planner for a static goal.
+        """Build on ``static``, a planner for a static goal.
 
         Args:
             static: as above.
-            turn: how the tool is to be turned, for one that reads ``goal_pose``.
+            turn: how the tool is to be turned, for a static planner that reads ``goal_pose``.
             scene: digest of its scene; None if it has none.
         """
         super().__init__()
@@ -42,7 +42,7 @@ class TargetPursuit(Remembering):
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         """Write ``goal`` (*B, D) [m, world] and ``arrival_steps`` (*B,), which is 0, and act.
 
-        Rows in which something that is read is no number get action 0.
+        Rows in which an input is NaN or infinite get action 0.
         """
         target_pos = read(tensordict, keys.TARGET_POS, "TargetPursuit")
         check_points(keys.TARGET_POS, target_pos)
@@ -70,7 +70,7 @@ class EndOfForecast:
     def __call__(
         self, forecast: Forecast, target_pos: Tensor, eta: ArrivalQuery, context: SearchContext = NO_CONTEXT
     ) -> Meeting:
-        """The end of the forecast, in F steps; ``eta`` is asked once, whether the robot is ever there."""
+        """The end of the forecast, in F steps; ``eta`` is asked once whether the robot can reach it."""
         goal = forecast.path[..., -1, :]
         never = eta(goal.unsqueeze(-2)).never.squeeze(-1)
         steps = torch.full_like(never, forecast.path.shape[-2], dtype=torch.int64)
@@ -78,7 +78,7 @@ class EndOfForecast:
 
 
 class RecordedFuture(ForecastModel):
-    """Stands in for a forecaster and tells the truth, cut from a recording of the same episode.
+    """A forecaster that returns the true future, from a recording of the same episode.
 
     Entry k of ``target_future`` is where the target was at step k of the episode, with the arm held still.
     """
@@ -139,7 +139,7 @@ def oracle_trajectory(
 
     Args:
         static: as of `DynamicPlanner`, like ``eta`` and ``parts``.
-        eta: tells how long ``static`` takes to a goal.
+        eta: predicts how long ``static`` needs to a goal.
         horizon: as far as its search may look into a recording [control steps].
         recorded: the truth is what was recorded before the episode with the robot at its start, ``target_future``
             (*B, T, D), and no longer true once the target was touched; else ``true_future`` (*B, F, D), which is.

@@ -1,4 +1,4 @@
-"""Planning takes time: how plans come into use late. A planner without a delivery uses them at once."""
+"""Planning takes time: when plans become available. A planner without a delivery uses them at once."""
 
 from __future__ import annotations
 
@@ -21,14 +21,14 @@ of the last argument."""
 
 
 class Delivery(Protocol):
-    """How plans come into use late; what it remembers from step to step is its ``State``."""
+    """When plans become available; what it remembers from step to step is its ``State``."""
 
     State: ClassVar[type[Any]]
     """A `NamedTuple` of tensors ``(*B, …)``."""
 
     @property
     def delay(self) -> int:
-        """Control steps for which a planner plans ahead: when it plans for is when the plan comes into use."""
+        """Control steps for which a planner plans ahead, to the moment at which the plan becomes available."""
         ...
 
     def start(self, plan: Plan, /) -> Any:
@@ -71,7 +71,7 @@ class Pending(NamedTuple):
     path: Tensor
     age: Tensor
     steps: Tensor
-    """``(*B,)`` int64 control steps from now until it comes into use; negative for none."""
+    """``(*B,)`` int64 control steps until it becomes available; negative for none."""
 
     @property
     def plan(self) -> Plan:

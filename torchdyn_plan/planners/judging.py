@@ -19,12 +19,12 @@ LARGEST = 1e6
 
 
 class Judgement(NamedTuple):
-    """Rows of which something is no number, or too large to be one; None where every row is good."""
+    """Rows with an entry that is NaN, infinite or too large; None if every row is good."""
 
     blind: Tensor | None = None
-    """``(*B,)`` bool: what is read of the robot, or what its static planner remembers, is bad."""
+    """``(*B,)`` bool: the robot state, or the memory of its static planner, is bad."""
     bad_input: Tensor | None = None
-    """``(*B,)`` bool: what is read of the robot or of the target is bad."""
+    """``(*B,)`` bool: an entry of the robot or of the target is bad."""
     spoiled: Tensor | None = None
     """``(*B,)`` bool: what the planner remembers is bad."""
 
@@ -69,7 +69,7 @@ def judge_rows(tensordict: TensorDictBase, read: Sequence[Any], batch: torch.Siz
 
 
 def bad_rows(values: Sequence[Tensor], batch: torch.Size) -> Tensor:
-    """Rows ``(*B,)`` bool in which some of ``values`` (*B, …) is no number, or too large to be a measurement."""
+    """Rows ``(*B,)`` bool in which some of ``values`` (*B, …) is NaN, infinite, or too large to be a measurement."""
     bad = torch.zeros(batch, dtype=torch.bool)
     for value in values:
         if value.is_floating_point():
@@ -81,7 +81,7 @@ def bad_rows(values: Sequence[Tensor], batch: torch.Size) -> Tensor:
 def act(static: Any, tensordict: TensorDictBase, blind: Tensor) -> TensorDictBase:
     """Let the ``static`` planner act; rows that are ``blind`` (*B,) get action 0, whatever it makes of them.
 
-    It is shown zeros there, in a copy: what was read stays as it was. A goal of theirs that is no number is 0, too.
+    It is shown zeros there, in a copy: what was read stays as it was. A NaN or infinite goal of theirs is 0, too.
     """
     goal = tensordict.get(keys.GOAL)
     tensordict.set(keys.GOAL, _zero(goal, bad_rows([goal], goal.shape[:-1])))

@@ -27,7 +27,7 @@ if TYPE_CHECKING:
 
 
 class Slot(NamedTuple):
-    """Where the state of one part lies in the memory, and how it begins and ages."""
+    """Where the state of one part is stored in the memory, and how it starts and ages."""
 
     kind: type[Any]
     """Its `NamedTuple` of tensors ``(*B, …)``."""

@@ -1,4 +1,4 @@
-"""What a dynamic planner sees of its robots and their targets at one step."""
+"""What a dynamic planner observes of robots and targets at one step."""
 
 from __future__ import annotations
 

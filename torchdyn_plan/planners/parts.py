@@ -34,11 +34,11 @@ PARTS = ("static", "forecaster", "eta", "search", "schedule", "maneuver", "deliv
 
 
 class ComposedPlanner(PretrainedPlanner, Remembering):
-    """Holds the parts of a planner for a moving target; `DynamicPlanner` says what is done with them.
+    """Holds the parts of a planner for a moving target; `DynamicPlanner` uses them.
 
-    Parts do not change afterwards: `with_parts` makes another planner. In evaluation mode, in which planners are
+    Parts are immutable: `with_parts` makes another planner. In evaluation mode, in which planners are
     loaded, ``prepared`` holds copies of its models for inference. Plans are made by these wherever they stand for the
-    models: `torchdyn_plan.nets.inference.Prepared` says where. ``train()`` leaves them, and ``eval()`` makes them anew.
+    models: `torchdyn_plan.nets.inference.Prepared` says where. ``train()`` drops them, ``eval()`` makes them again.
     """
 
     prepared: Prepared | None = None
@@ -58,21 +58,21 @@ class ComposedPlanner(PretrainedPlanner, Remembering):
         chunk: int | None = None,
         scene: str | None = None,
     ) -> None:
-        """Join the parts.
+        """Build from parts.
 
         Args:
             static: planner for a static goal, from tensordict to tensordict (`StaticPlanner`).
             forecaster: forecasts the target; a function of its history will do, which returns positions (*B, F, D). By
-                default the target goes on as it does, `torchdyn_plan.nets.ConstantVelocity`.
-            eta: tells how long ``static`` takes to a goal; a function of robot states (*B, 1, S) and goals (*B, K, D)
-                will do, which returns control steps (*B, K). By default what ``static`` says of itself.
-            search: chooses the meeting on the forecast; by default the first that can be made, of all its steps.
-            schedule: when to plan anew; every fourth control step by default.
-            maneuver: which goal the static planner is sent to at each step; the meeting place by default.
-            delivery: how plans come into use late: `Delayed`, or made in the `Background`; at once by default.
-            lost: when a target is lost; None if it cannot be.
-            turn: how the tool is to be turned where it meets the target; then ``goal_pose`` is written beside ``goal``,
-                of three coordinates, which ``static`` and ``eta`` are to read. None where places are all.
+                default constant velocity, `torchdyn_plan.nets.ConstantVelocity`.
+            eta: predicts how long ``static`` needs to a goal; may be a function from robot states (*B, 1, S) and goals
+                (*B, K, D) to control steps (*B, K). By default ``static.arrival_model()``.
+            search: chooses the meeting on the forecast; by default the first step at which both can be there.
+            schedule: when to plan again; every fourth control step by default.
+            maneuver: chooses the goal of the static planner at each step; the meeting place by default.
+            delivery: when plans become available: `Delayed` or `Background`; at once by default.
+            lost: decides when a target is lost; None if it cannot be.
+            turn: orientation of the tool where it meets the target; then ``goal_pose`` is written beside ``goal``, of
+                three coordinates, and ``static`` and ``eta`` should read it. None for positions alone.
             chunk: plan in blocks of exactly this many rows, so that results do not depend on the batch size.
             scene: digest of the scene that the planner belongs to; None if it belongs to none.
 
@@ -122,7 +122,7 @@ class ComposedPlanner(PretrainedPlanner, Remembering):
         return cls(static, forecaster, eta, **(own | parts))
 
     def with_parts(self, **parts: Any) -> Self:
-        """Another planner of the same parts, but for those given, by the names of the constructor's arguments."""
+        """Another planner with some parts replaced, by the names of the constructor's arguments."""
         for name in parts:
             check_choice("part", name, PARTS)
         return type(self)(**(self.part_settings() | parts)).train(self.training)
@@ -167,7 +167,7 @@ class ComposedPlanner(PretrainedPlanner, Remembering):
         return self.prepare()
 
     def __getstate__(self) -> dict[str, Any]:
-        # A copy has weights of its own, of which it prepares its models.
+        # A copy has other weights, from which it prepares its models.
         return {**self.__dict__, "prepared": None}
 
     def __setstate__(self, state: dict[str, Any]) -> None:

@@ -1,4 +1,4 @@
-"""A plan: where and when robot and target will meet, how it stands, and when its target is lost."""
+"""A plan: where and when robot and target meet, its status, and when its target is lost."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ class PlanStatus(IntEnum):
     TARGET_LOST = 4
     """The target is lost."""
     BAD_INPUT = 5
-    """Something that is read of the target or the robot is no number, or too large to be a measurement."""
+    """An entry that is read of the target or the robot is NaN, infinite, or too large to be a measurement."""
     NO_TRACK = 6
     """Too little was measured of the target, or too long ago, to know where it is."""
 

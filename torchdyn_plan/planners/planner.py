@@ -30,9 +30,10 @@ class DynamicPlanner(ComposedPlanner):
     """Meets a moving target: history → forecast → meeting → goal → action.
 
     Writes ``goal`` (*B, 3 or 2) [m, world], ``arrival_steps`` (*B,), what the static planner writes, and under ``plan``
-    the memory for the next step and each row's `PlanStatus`. A row plans when its schedule says so, and starts afresh
-    at ``step_count`` 0. One that cannot plan, as its input or forecast is no number or its target is lost, holds its
-    tool still and tries again at each step; one whose robot is not seen gets action 0. Parts: see `ComposedPlanner`.
+    the memory for the next step and each row's `PlanStatus`. A row plans when its schedule says so, and restarts at
+    ``step_count`` 0. A row that cannot plan, because its input or forecast is NaN or infinite or its target is lost,
+    holds its tool still and tries again at each step. A row with a bad robot state gets action 0.
+    Parts: see `ComposedPlanner`.
     """
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
@@ -73,7 +74,7 @@ class DynamicPlanner(ComposedPlanner):
         return self.static(tensordict) if found.blind is None else act(self.static, tensordict, found.blind)
 
     def replan(self, observation: Observation, plan: Plan) -> Plan:
-        """A new plan for every row, from what is seen and the plan in use: pure, and the one entry to planning."""
+        """A new plan for every row, from the observation and the plan in use: a pure function."""
         delay = 0 if self.delivery is None else self.delivery.delay
         forecaster, eta_model = self.forecaster, self.eta
         if self.prepared is not None and self.prepared.stands_for(observation.robot_state, *observation.seen):
@@ -85,7 +86,7 @@ class DynamicPlanner(ComposedPlanner):
         forecast, target_pos = Forecast(path, forecast.spread), observation.target_pos
         eta, planned_steps = eta_model.from_state(observation.robot_state), plan.arrival_steps
         if delay:
-            # From here on all is counted from when the plan comes into use.
+            # From here on, times count from the moment at which the plan becomes available.
             forecast, eta = forecast.after(delay), later(eta, delay)
             target_pos, planned_steps = path[..., delay - 1, :], (planned_steps - delay).clamp_min(0)
             turn = None if turn is None else turn[..., delay:, :]

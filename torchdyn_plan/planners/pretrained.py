@@ -57,7 +57,7 @@ class PretrainedPlanner:
     def save_pretrained(self, folder: str | Path) -> Path:
         """Write the planner into ``folder``: ``planner.json``, a ``.safetensors`` for each network, and a card.
 
-        A part that is a person's own function cannot be written: who loads the planner has to give it again.
+        A part that is a plain function cannot be saved: it must be passed again when the planner is loaded.
 
         Returns:
             The JSON file. Raises `OutputError` where it cannot be written.
@@ -270,7 +270,7 @@ def _read(file: Path) -> dict[str, Any]:
 
 
 def _card(content: Mapping[str, Any]) -> str:
-    """What a person wants to know of a planner in a folder, as Markdown."""
+    """Model card of a planner, as Markdown."""
     lines = ["# Planner", "", f"- class: {content['class']}"]
     for name, value in content["parts"].items():
         known = value if not isinstance(value, Mapping) else value.get("part") or value.get("network") or "not saved"

@@ -1,4 +1,4 @@
-"""What planners and their parts look like from outside: anything of these shapes can be put in."""
+"""Interfaces of planners and their parts: anything that implements them can be used."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""When to plan anew: after a window of steps, or when the last plan no longer fits what is seen."""
+"""When to plan again: after a number of steps, or when the last plan no longer fits the observation."""
 
 from __future__ import annotations
 
@@ -150,7 +150,7 @@ class ReplanSchedule:
     def tick(
         self, clock: Clock, observation: Observation, plan: Plan, *, busy: Tensor | None, late: Late
     ) -> tuple[Clock, Tensor]:
-        """Which rows plan now, as `Schedule.tick` says, whatever has become of the plan."""
+        """Which rows plan now, as `Schedule.tick` says; the plan itself does not matter."""
         over = clock.countdown <= 0
         if not (torch.compiler.is_compiling() or debug_unwrap(over).any()):
             return clock, over
@@ -161,7 +161,7 @@ class ReplanSchedule:
 
 @dataclass(frozen=True, kw_only=True)
 class EventSchedule:
-    """Plans anew when the last plan no longer fits: the target left its forecast, the robot is late, or time is over.
+    """Plans again when the last plan no longer fits: the target left its forecast, the robot is late, or time is over.
 
     It looks every few steps, so that times between plans are multiples of them and `ExactSearch` finds its candidates
     on the same places of the path. A row that is busy then plans at the next look.

@@ -33,7 +33,7 @@ SHOWN = (keys.TARGET_POS, keys.TARGET_HISTORY, keys.TARGET_COVARIANCE)
 
 
 class TrackedPlanner(PretrainedPlanner, Remembering):
-    """Puts a `Track` between what is measured of the target and a planner, whose ``target_pos`` and history it writes.
+    """Puts a `Track` between the measurements and a planner; it writes the planner's ``target_pos`` and history.
 
     Reads ``measured_pos`` (*B, M, D) and ``measured_time`` (*B, M), up to M measurements that have come since the last
     step; where they are absent, ``target_pos`` is one of now. The planner sees where the target is now by the track,

@@ -1,4 +1,4 @@
-"""A task in one frozen object: what differs from task to task, so that everything else can be written once.
+"""A task in one frozen object: everything that differs from task to task.
 
 Nothing heavy is imported here or in the modules that define tasks: what a task needs is imported where it is used, so
 that the command line can ask a task for its options at once.
@@ -23,6 +23,7 @@ if TYPE_CHECKING:
     from torch import Tensor
 
     from torchdyn_plan.envs.moving_target import MovingTargetEnv
+    from torchdyn_plan.evaluation.curves import PaperMoments, PaperPanel
 
 NOISY = "noisy_"
 """Begin of the names of networks for targets that are measured with noise, and seen by a track."""
@@ -59,7 +60,7 @@ def setting(
 
 @dataclass(frozen=True, kw_only=True)
 class Settings:
-    """What varies from run to run of a task, beside its episodes; a task's own are a frozen subclass, by `setting`."""
+    """Settings of a task that vary from run to run; a task defines a frozen subclass with fields made by `setting`."""
 
     def __post_init__(self) -> None:
         from torchdyn_plan.checks import check_choice, check_number
@@ -74,18 +75,18 @@ class Settings:
 
 
 class Words(NamedTuple):
-    """How a task speaks of its outcomes; files and tables use these words."""
+    """Names of a task's outcomes in files and tables."""
 
     success: str
-    """Flag of the environment that tells success, as ``trapped``."""
+    """Flag of the environment that marks a success, such as ``trapped``."""
     steps: str
-    """How its duration is called, as ``steps to trap``."""
+    """Name of the time to a success, such as ``steps to trap``."""
     target: str = "target"
-    """What moves, as ``ball``."""
+    """What moves, such as ``ball``."""
 
 
 class Truth(NamedTuple):
-    """What is known of E episodes before a planner plays them."""
+    """What is known about E episodes before a planner runs them."""
 
     future: Tensor
     """``(E, T, D)`` positions of the targets at steps 0 … T-1, had no robot touched them [m, world]."""
@@ -94,18 +95,18 @@ class Truth(NamedTuple):
 
 
 class Verdict(NamedTuple):
-    """What a task says of E episodes that were played, ``(E,)`` each."""
+    """A task's assessment of E episodes, ``(E,)`` each."""
 
     cause: Tensor
-    """int64 index into `Task.causes` of what each failed of; -1 for a success."""
+    """int64 index into `Task.causes` of the cause of failure; -1 for a success."""
     flags: Mapping[str, Tensor]
     """Further outcomes, bool, by name."""
     evidence: Mapping[str, Tensor]
-    """What the causes follow from, by name."""
+    """Measurements from which the causes follow, by name."""
 
 
 class PaperCurves(Protocol):
-    """Success rates that a paper reports for a task, to stand beside ours."""
+    """Success rates that a paper reports for a task, for comparison with ours."""
 
     def rate(self, planner: str, static: str, settings: Any, *, solvable: bool) -> float | None:
         """The paper's success rate at these settings, over all or over solvable episodes; None where it has none."""
@@ -117,6 +118,10 @@ class PaperCurves(Protocol):
         """The paper's curve over the setting ``over``, the others as in ``settings``: abscissae and success rates."""
         ...
 
+    def panels(self) -> Sequence[PaperPanel | PaperMoments]:
+        """The diagrams of the paper's figures, which ``torchdyn-plan report`` draws with our results in them."""
+        ...
+
 
 @dataclass(frozen=True, kw_only=True)
 class PolicyTraining:
@@ -125,7 +130,7 @@ class PolicyTraining:
     summary: str
     """One line for ``--help``."""
     options: type[Any]
-    """Frozen dataclass of its own options, each with a line of text under it; all have defaults."""
+    """Frozen dataclass of its options, each documented by a line of text below it; all have defaults."""
     goal_task: Callable[..., Any]
     """Makes the `torchdyn_plan.training.goal_task.GoalTask` from those options and ``num_threads``."""
     recipe: Callable[[], Any]
@@ -136,19 +141,19 @@ class PolicyTraining:
 
 @dataclass(frozen=True, kw_only=True)
 class Task:
-    """A robot, a moving target, and what it means to meet it.
+    """A robot, a moving target, and what counts as meeting it.
 
     Every callable imports what it needs when it is called. ``settings`` below is an instance of the task's settings.
     """
 
     name: str
-    """As on the command line, and in the names of weights."""
+    """Name on the command line and in the names of weights."""
     summary: str
     """One line for ``--help``."""
     settings: type[Settings]
-    """What varies from run to run."""
+    """Settings that vary from run to run."""
     words: Words
-    """How it speaks of its outcomes."""
+    """Names of its outcomes in files and tables."""
     max_steps: int
     """Control steps of an episode at most."""
     control_step: float
@@ -156,7 +161,7 @@ class Task:
     make_env: Callable[..., MovingTargetEnv]
     """``(settings, *, num_envs, seed, split, num_threads)`` to the environment; and ``sensor`` where there is one."""
     digest: Callable[[], str]
-    """Hash of the scene: what data, weights and planners belong to."""
+    """Hash of the scene. Data, weights and planners belong to the scene with their hash."""
     static_planners: Mapping[str, Callable[..., Any]]
     """Makers of static planners by name, ``(*, chunk, weights)``: rows that it sees at once, None for all of them at a
     time, and file or folder of a policy's weights, None for those that ship. The first is taken when none is named."""
@@ -170,7 +175,7 @@ class Task:
     """What the weights that ship of networks of the target's motion are called, if targets move alike in several
     scenes; `weights_name` if it is empty."""
     rivals: tuple[str, ...] = ()
-    """Planners that run only when they are named."""
+    """Planners that run only if named."""
     rows_at_once: tuple[int, int] = (32, 64)
     """Rows that networks and static planners see at once in an evaluation, so that its results do not depend on how
     many environments run side by side."""
@@ -361,7 +366,7 @@ def task_names() -> list[str]:
 def load_task(name: str | Task, scene: str | None = None) -> Task:
     """The task of that name, or at ``package.module:NAME`` if it is nowhere registered; a `Task` is returned as it is.
 
-    ``scene`` is the name of one of its scenes, as `Task.in_scene` takes it; None for the task as it comes.
+    ``scene`` is the name of one of its scenes, as `Task.in_scene` takes it; None for the task's default scene.
 
     Raises:
         InputError: there is no such task or scene; the message lists those there are.

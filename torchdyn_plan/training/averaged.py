@@ -21,7 +21,7 @@ from torchdyn_plan.training.goal_task import SEEN, DDPGRecipe
 
 @dataclass(frozen=True, kw_only=True)
 class AveragedRecipe(DDPGRecipe):
-    """How a policy is trained by `AveragedDDPG`; what is not told here means what it means to `DDPGRecipe`."""
+    """How a policy is trained by `AveragedDDPG`; other fields are as in `DDPGRecipe`."""
 
     iterations: int = 100
     """Rounds of collection and updates."""

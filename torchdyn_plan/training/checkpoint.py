@@ -44,7 +44,7 @@ def save_checkpoint(
         network: its parameters and buffers are kept.
         optimiser: its state for each parameter is kept.
         generator: the CPU generator that every later draw comes from.
-        settings: what must be the same when the fit goes on; JSON values.
+        settings: what must be equal when the fit is resumed; JSON values.
         progress: JSON values that `load_checkpoint` returns.
     """
     tensors = {f"network.{name}": value for name, value in network.state_dict().items()}

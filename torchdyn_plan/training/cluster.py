@@ -26,7 +26,7 @@ class ClusterDDPG(DDPG):
     """`DDPG` whose environments are spread evenly over Ray workers; each worker has its own series of episodes.
 
     A round waits for all workers, and the next one begins with the policy that the updates left. Workers keep their own
-    random states, which no checkpoint holds: a resumed training goes on, but not to the last bit.
+    random states, which no checkpoint holds: a resumed training continues, but not bit for bit.
     """
 
     def __init__(

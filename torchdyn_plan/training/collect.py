@@ -47,20 +47,20 @@ def collect(
     planner: StaticPlanner | None = None,
     name: str = "own",
 ) -> None:
-    """Write shards of data and a description of them into ``out``; whole shards that are there are kept.
+    """Write shards of data and their description into ``out``; complete existing shards are kept.
 
     Args:
-        task: whose data, or its name.
+        task: a task, or its name.
         what: ``paths`` of targets for a forecaster, or ``arrivals`` of a static planner for an arrival-time network.
-        out: folder; paths and arrivals of one scene may lie in it side by side.
+        out: folder; it may hold both paths and arrivals of one scene.
         episodes: paths, or sequences of runs.
-        seed: which series of episodes.
+        seed: series of episodes.
         num_envs: episodes that run side by side; numbers of a block are drawn together.
         num_threads: of the simulation, 0 for all cores; does not change the data.
         static: name of the static planner whose arrivals are measured; the task's default for None.
-        weights: policy of that static planner, a file or a folder of its training; the one that ships for None.
-        planner: a person's own static planner, whose arrivals are measured in place of those of ``static``.
-        name: what the description calls it.
+        weights: policy of that static planner, a file or a folder of its training; the shipped one for None.
+        planner: your own static planner, whose arrivals are measured instead of those of ``static``.
+        name: name of ``planner`` in the description.
 
     Raises:
         InputError: the task records no such data, an argument is wrong, or a shard that is there was made in another
@@ -94,7 +94,7 @@ def collect(
 
 
 def collect_tracks(task: Task | str, file: Path, out: Path, *, seed: int = 0) -> int:
-    """Write a person's own recordings of targets into ``out``, as `collect` writes paths; returns how many there are.
+    """Write recorded targets into ``out``, in the format in which `collect` writes paths; returns their number.
 
     Args:
         task: whose control step they are brought to, or its name.
@@ -175,7 +175,7 @@ class _Wanted:
         return [torch.arange(first, min(first + self.num_envs, last)) for first in starts]
 
     def metadata(self, index: int, scene: str) -> dict[str, str]:
-        """What decides a shard's numbers, beside its name."""
+        """Everything that determines the content of a shard, apart from its name."""
         episodes = sum(map(len, self.blocks(index)))
         made = {"scene": scene, "num_envs": str(self.num_envs), "episodes": str(episodes)}
         if self.what == "arrivals":

@@ -46,7 +46,7 @@ class DDPG:
         self._rollouts: Iterator[TensorDictBase] = iter(self.collector)
 
     def prepare(self, policy: TensorDictModule) -> None:
-        """Make what updates need beside actor and critic; ``policy`` is the actor as a module of tensordicts."""
+        """Make what updates need besides actor and critic; ``policy`` is the actor as a tensordict module."""
         value = ValueOperator(self.critic, in_keys=[*SEEN, keys.ACTION])
         self.loss = PenalisedDDPGLoss(policy, value, delay_actor=True, delay_value=True)
         self.loss.make_value_estimator(self.make_targets())
@@ -67,7 +67,7 @@ class DDPG:
 
     @property
     def learned(self) -> Actor:
-        """The policy that the training is for: what is scored and kept."""
+        """The policy that is scored and kept."""
         return self.actor
 
     def make_targets(self) -> Any:
@@ -136,7 +136,7 @@ class DDPG:
         return {name: float(value) / self.recipe.updates for name, value in totals.items()}
 
     def update(self, batch: TensorDictBase, number: int = 0) -> dict[str, Tensor]:
-        """One step of both networks and of their targets; raises `TrainingError` where a loss is no number."""
+        """One step of both networks and of their targets; raises `TrainingError` if a loss is NaN or infinite."""
         self.optimiser.zero_grad(set_to_none=True)
         figures = self.differentiate(batch, number)
         norms = [nn.utils.clip_grad_norm_(entry["params"], self.recipe.clip) for entry in self.optimiser.param_groups]

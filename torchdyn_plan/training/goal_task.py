@@ -54,7 +54,7 @@ class GoalTask(ABC):
     policy_config: PolicyConfig
     """Sizes of the networks."""
     stored: tuple[Any, ...] = ()
-    """Keys of a transition that `reward` reads, beside those that every learner needs."""
+    """Keys of a transition that `reward` reads, in addition to those that every learner needs."""
     length: int
     """Actions in an episode; all episodes have as many."""
 

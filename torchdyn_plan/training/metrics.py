@@ -24,7 +24,7 @@ SOON = 30
 def forecast_errors(
     forecast: Tensor, windows: Windows, *, ahead: Sequence[int], fast: float = FAST
 ) -> list[dict[str, Any]]:
-    """Distances between forecast and truth, beside those of constant velocity.
+    """Distances between forecast and truth, with those of constant velocity for comparison.
 
     Windows are scored by kind: ``full`` and ``padded`` histories of targets that move and are not lost, those of them
     that are ``fast`` at the present, ``lost`` ones, scored while the target is not yet lost, and ``still`` ones, whose

@@ -68,7 +68,7 @@ class Recipe:
 
 
 class Progress(TypedDict):
-    """Where a fit stands, beside its tensors."""
+    """State of a fit, apart from its tensors."""
 
     step: Count
     total: float
@@ -150,7 +150,7 @@ class _Descent:
         return self.curve
 
     def advance(self) -> None:
-        """One step of the optimiser; nothing is changed if the loss or its gradient is no number."""
+        """One step of the optimiser; nothing changes if the loss or its gradient is NaN or infinite."""
         for group in self.optimiser.param_groups:
             group["lr"] = self.recipe.rate(self.step)
         self.optimiser.zero_grad(set_to_none=True)

@@ -1,4 +1,4 @@
-"""The training of a policy: rounds of DDPG, scored, logged and kept, that goes on exactly where it was cut off."""
+"""Training of a policy: rounds of DDPG with scores, logs and checkpoints; it resumes exactly where it stopped."""
 
 from __future__ import annotations
 
@@ -124,7 +124,7 @@ def fit_policy(
         TrainingError: a loss is NaN, or the checkpoint is damaged, of another task, or has other settings.
     """
     check_number("score_every", score_every, minimum=1, integer=True)
-    # TorchRL tells of every storage that it makes, in between the progress bar.
+    # TorchRL logs every storage that it makes, which breaks the progress bar.
     logging.getLogger("torchrl").setLevel(logging.WARNING)
     recipe = recipe or DDPGRecipe()
     with one_thread():
@@ -141,7 +141,7 @@ class Learner(TypedDict):
 
 
 class Progress(TypedDict):
-    """Where a training stands, beside its tensors."""
+    """State of a training, apart from its tensors."""
 
     curve: list[dict[str, float]]
     best: dict[str, float]

@@ -14,7 +14,7 @@ from torchdyn_plan.checks import check_number
 STATES_PER_RUN = 5
 """Intermediate states taken from each run (paper, Section III-B.3)."""
 AS_NEAR = 0.015
-"""A tool that is so near to the place where it is nearest to its goal is as near as it comes [m]."""
+"""A tool within this distance of its closest approach to the goal counts as being there [m]."""
 
 
 class Runner(Protocol):

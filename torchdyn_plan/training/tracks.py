@@ -212,7 +212,7 @@ def _read_parquet(file: Path) -> tuple[dict[str, Any], int]:
         table = parquet.read_table(file)
     except (arrow.ArrowException, OSError) as error:
         raise InputError(f"{short_path(file)} is no Parquet file: {error}") from error
-    # Missing values become None, and no numbers.
+    # Missing values become None.
     return _chosen(file, {name: table[name].to_pylist() for name in table.column_names}), 0
 
 

@@ -41,14 +41,14 @@ def train(
     options: Any = None,
     algorithm: str | None = None,
 ) -> Path:
-    """Train a network, or go on where its folder stands.
+    """Train a network, or resume from its folder.
 
     Args:
         task: whose network, or its name.
         network: ``forecaster``, ``eta``, ``nearest_eta``, ``spread``, ``noisy_forecaster`` and ``noisy_spread`` for
             targets that are measured with noise, or one of the task's policies. A spread is fitted to the errors of
-            the forecaster in ``out``, or of the one that ships if there is none.
-        data: folder of the collected shards; a policy reads none.
+            the forecaster in ``out``, or of the shipped one if there is none.
+        data: folder of the collected shards; not used for a policy.
         out: gets a folder of the network's name with checkpoint, curve, weights and card.
         steps: optimiser steps, of a policy rounds; the recipe's own for None, as are ``batch`` and ``lr``.
         batch: samples a step.
@@ -56,7 +56,7 @@ def train(
         seed: of initialisation, held-out data and draws.
         device: where to train.
         resume: whether to continue from the checkpoint in ``out``.
-        num_envs: of a policy: episodes that run side by side; the recipe's own for None.
+        num_envs: of a policy: episodes simulated at once; the recipe's value for None.
         num_threads: of a policy: threads of the simulation, 0 for all cores; does not change the result.
         workers: of a policy: Ray workers that run the episodes, 0 for none.
         static: of ``eta`` and ``nearest_eta``: the static planner whose arrivals the data must be; any for None.

@@ -94,7 +94,7 @@ def direction(angle: Tensor) -> Tensor:
 
 
 class ChaseEnv(MovingTargetEnv):
-    """A base that is told its velocity meets a walker; an action of size 1 is its greatest speed.
+    """A base with commanded velocity meets a walker; an action of size 1 is its maximum speed.
 
     The base changes its velocity as fast as it may until it has the one it is told, in a straight line between the two.
     ``robot_state`` is its place [m] and its velocity [m/s]. Plain tensors: thousands of episodes side by side.

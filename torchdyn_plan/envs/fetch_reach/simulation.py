@@ -171,5 +171,5 @@ class FetchSimulation:
         self._turn[:, 0] = torch.tensor(self._xquat[:, self._gripper]) + torch.tensor(_DOWN, dtype=torch.float64)
         self.batch.step(ids, nstep=SUBSTEPS)
         self.qpos[:, self._fingers] = 0.0
-        # Forces are not read: the next step computes them, and goes on from here.
+        # Forces are not read: the next step computes them.
         self.batch.forward(ids, stage=mujoco.mjtStage.mjSTAGE_VEL.value)

@@ -189,5 +189,5 @@ class TrapperEnv(MovingTargetEnv):
         return self._painter.picture(self.posture(row), width, height, self._marks(row))
 
     def _marks(self, row: int) -> list[Marks]:
-        """What a picture of environment ``row`` shows beside the scene."""
+        """What a picture of environment ``row`` shows in addition to the scene."""
         return []

@@ -22,7 +22,7 @@ class Approach(Protocol):
     """
 
     def twist(self, pose: Sequence[Tensor], goal: Sequence[Tensor], /) -> list[Tensor]:
-        """The twist still to go, the first R of its six rows [v; ω] [m; rad], in the arm's base frame.
+        """The twist still to go, the first R of its six rows [v; ω] in m and rad, in the arm's base frame.
 
         Args:
             pose: the first three rows of the tool's pose in the base frame, entry by entry [m].

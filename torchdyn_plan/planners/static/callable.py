@@ -42,7 +42,7 @@ class CallablePlanner(StaticPlannerModule):
 
 
 class TensorDictFunction(StaticPlannerModule):
-    """Static planner that is a person's own function from tensordict to tensordict."""
+    """Static planner made of a function from tensordict to tensordict."""
 
     def __init__(self, function: Callable[[TensorDictBase], TensorDictBase]) -> None:
         """Wrap ``function``, which writes ``action`` (*B, A) and says of no other key that it reads or writes it."""

@@ -40,7 +40,7 @@ class Path(NamedTuple):
 
 
 PASSES = 2
-"""Times that a step is solved anew without the joints that it would push out of their limits."""
+"""Times that a step is solved again without the joints that it would push beyond their limits."""
 GOAL_STEPS, GOAL_STEP = 10, 0.5
 """Steps in which the end of a path is found, and the most that a joint moves in one of them [rad]."""
 GOAL_DAMPING = 0.005
@@ -55,7 +55,7 @@ PATH_NAMES = tuple(f"path_{field}" for field in Path._fields)
 
 
 class IKPlanner(Precise, StaticPlannerModule):
-    """Drives an arm's tool to ``goal`` by inverse kinematics, in the way that its approach says.
+    """Drives an arm's tool to ``goal`` by inverse kinematics, along the path of its approach.
 
     Reads ``joint_pos`` (*B, N) [rad], ``goal`` (*B, 3) [m, world] and ``step_count`` (*B,); writes ``action`` (*B, N)
     and its memory under ``plan``. The arm follows a path of `PATH_LENGTH` steps from where it was when the path began,
@@ -317,7 +317,7 @@ class IKPlanner(Precise, StaticPlannerModule):
         return whole
 
     def _step_fused(self, joint_pos: Tensor, goal: Tensor) -> tuple[Tensor, Tensor]:
-        """`step` of rows in one compiled loop; rows that push a joint out of its limits are stepped anew."""
+        """`step` of rows in one compiled loop; rows that push a joint beyond its limits are solved again."""
         assert self._fused is not None
         action, reached, pushed = self._fused(joint_pos, goal)
         # A row alone is read as it is: a sum would take a tenth of the step.

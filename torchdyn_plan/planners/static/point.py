@@ -1,4 +1,4 @@
-"""A static planner for a point that has limits of speed and acceleration, and is told a velocity: a base, a drone."""
+"""Static planner for a point with limits on speed and acceleration and a velocity command: a base, a drone."""
 
 from __future__ import annotations
 
@@ -20,10 +20,10 @@ FADE = 0.25
 
 
 class PointPlanner(StaticPlannerModule):
-    """Sends a point straight to ``goal`` as fast as it may; ``action`` is its velocity as a fraction of its speed.
+    """Moves a point straight to ``goal`` as fast as allowed; ``action`` is velocity as a fraction of the speed limit.
 
     Reads ``tool_pos`` (*B, D) and ``goal`` (*B, D) [m, world], writes ``action`` (*B, D) of size 0 to 1. One that stops
-    slows down as its acceleration lets it. It remembers nothing.
+    brakes within its acceleration. It has no memory.
     """
 
     def __init__(

@@ -39,7 +39,7 @@ def earliest_meeting(world: ChaseWorld, path: Tensor) -> Tensor:
 
 
 def find_truth(settings: Any, *, episodes: int, seed: int, split: str, static: str = "", num_threads: int = 0) -> Truth:
-    """Walks, and whether walkers can be met within an episode at all, whatever the static planner."""
+    """Walks, and whether walkers can be met within an episode at all, for any static planner."""
     world = ChaseWorld()
     how: dict[str, Any] = {"speed": settings.speed, "turning": settings.turning, "split": split, "seed": seed}
     walks = Walks.draw(world, torch.arange(episodes), **how)

@@ -78,7 +78,7 @@ def pursuit(parts: PlannerParts) -> Any:
 
 
 def meet(parts: PlannerParts) -> Any:
-    """The planner as it comes: nothing of it is trained or tuned."""
+    """`DynamicPlanner` with its defaults: nothing is trained or tuned."""
     from torchdyn_plan.planners import DynamicPlanner
 
     return DynamicPlanner(parts.static, forecaster(), **parts_of(parts)).eval()
@@ -93,7 +93,7 @@ def corner(parts: PlannerParts) -> Any:
 
 
 def oracle(parts: PlannerParts) -> Any:
-    """The planner as it comes, on the true future."""
+    """`DynamicPlanner` with its defaults, on the true future."""
     from torchdyn_plan.planners import DynamicPlanner, RecordedFuture
 
     return DynamicPlanner(parts.static, RecordedFuture(HORIZON), **parts_of(parts)).eval()

@@ -26,7 +26,7 @@ ROWS = 512
 """Meetings simulated side by side."""
 
 HORIZON = 50
-"""Control steps that the recorded truth goes on after the end of an episode."""
+"""Control steps for which the truth is recorded beyond the end of an episode."""
 
 
 def find_truth(

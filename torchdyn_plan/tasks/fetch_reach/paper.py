@@ -1,4 +1,4 @@
-"""The paper's success rates, read off its Figure 5, to stand beside ours."""
+"""The paper's success rates, read off its Figure 5, for comparison with ours."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from functools import cache
 from importlib.resources import files
 from typing import Any
 
-from torchdyn_plan.evaluation.curves import Curve, rate_at
+from torchdyn_plan.evaluation.curves import Curve, PaperLine, PaperPanel, rate_at
 from torchdyn_plan.tasks.fetch_reach.task import FetchReachSettings
 
 _NAMES = {"corner": "dynamic", "dher": "dher"}
@@ -33,6 +33,15 @@ class FetchReachCurves:
         if curve is None or solvable or over != "velocity" or settings.motion != "straight":
             return None
         return curve["x"], curve["y"]
+
+    def panels(self) -> list[PaperPanel]:
+        """The right half of Figure 5."""
+        lines = (
+            PaperLine("corner", "proportional", "dynamic planner (corner)"),
+            PaperLine("dher", "proportional", "DHER"),
+        )
+        title = "Dynamic FetchReach, all episodes"
+        return [PaperPanel("figure5", (0, 1), title, "velocity", {}, lines)]
 
 
 @cache

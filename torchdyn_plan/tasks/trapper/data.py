@@ -43,7 +43,7 @@ PRESENTS = (40, 100, 200)
 def record_rolls(
     blocks: Sequence[Tensor], *, seed: int, num_threads: int = 0, scene: TrapperScene | str | None = None
 ) -> dict[str, Tensor]:
-    """Balls rolled alone (the arm at home touches none), each at a velocity of its own up to `FASTEST`.
+    """Balls rolled alone (the arm at home touches none), each at a different velocity up to `FASTEST`.
 
     Args:
         blocks: numbers of the episodes of the split ``train``, those that roll side by side in one tensor each.

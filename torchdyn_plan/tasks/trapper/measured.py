@@ -32,7 +32,7 @@ class MeasuredArrival(ArrivalModel):
     ) -> None:
         """Measure arrivals of ``static`` in ``scene``.
 
-        With ``nearest`` none is *never*: the time to a place out of reach is that until the arm is as near as it comes.
+        With ``nearest`` none is *never*: to a place out of reach it is the time until the arm is as near as it gets.
         """
         super().__init__()
         self.nearest = nearest

@@ -25,7 +25,7 @@ from torchdyn_plan.tasks.task import Truth
 from torchdyn_plan.tasks.trapper.task import trapper_task
 
 HORIZON = 300
-"""Control steps that the recorded truth goes on after the end of an episode."""
+"""Control steps for which the truth is recorded beyond the end of an episode."""
 
 SPACING = 0.02
 """Greatest distance between neighbouring points of a map [m]."""

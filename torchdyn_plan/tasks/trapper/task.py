@@ -147,7 +147,7 @@ def corner_never(parts: PlannerParts) -> Any:
 
 
 def oracle(parts: PlannerParts) -> Any:
-    """The paper's planner on the true future, simulated anew when the ball was touched (paper, Section IV-A.2)."""
+    """The paper's planner on the true future, simulated again after the ball was touched (paper, Section IV-A.2)."""
     from torchdyn_plan.planners import oracle_trajectory
 
     return oracle_trajectory(parts.static, parts.nearest_eta, recorded=False, **going(parts)).eval()
