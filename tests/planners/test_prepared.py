@@ -51,7 +51,7 @@ def test_in_training_mode_it_plans_by_the_models_themselves(planner, seen):
 CHANGES = {
     "trained on": lambda planner: planner.forecaster.requires_grad_(True),
     "a network's head is trained": lambda planner: planner.eta.head.requires_grad_(True),
-    "changed in place": lambda planner: planner.forecaster.forecaster.head.bias.add_(1e-3),
+    "changed in place": lambda planner: planner.forecaster.exact.forecaster.head.bias.add_(1e-3),
     "loaded": lambda planner: planner.load_state_dict(planner.state_dict()),
     "a network loaded": lambda planner: planner.eta.load_state_dict(planner.eta.state_dict()),
     "exchanged": lambda planner: setattr(planner.eta.head, "bias", torch.nn.Parameter(planner.eta.head.bias.data)),
@@ -81,7 +81,7 @@ def test_a_copy_of_a_planner_has_copies_of_its_own_models(planner, seen, make):
     assert torch.equal(path_of(made, seen(made)), path_of(planner, seen(planner)))
     assert not by_models(made, seen(made))
     with torch.no_grad():
-        made.forecaster.forecaster.head.bias.add_(1.0)
+        made.forecaster.exact.forecaster.head.bias.add_(1.0)
     assert not torch.equal(path_of(made, seen(made)), path_of(planner, seen(planner)))
     assert not by_models(planner, seen(planner))
 
@@ -108,7 +108,7 @@ def test_derivatives_are_those_of_the_models(planner, seen):
 
 def test_weights_that_are_exchanged_for_a_call_are_heeded(planner, seen):
     observation = seen(planner)
-    name = "forecaster.forecaster.head.bias"
+    name = "forecaster.exact.forecaster.head.bias"
     moved = {name: dict(planner.named_parameters())[name] + 1.0}
 
     class Replan(torch.nn.Module):

@@ -143,8 +143,14 @@ def test_one_that_waits_and_drops_comes_with_its_spread(shipped, due):
     with pytest.raises(WeightsError, match=r"forecaster of .*no weights .*spread-trapper.* for SpreadNetwork"):
         DynamicPlanner.from_pretrained("trapper-ik-wait_and_drop")
     SpreadNetwork(features=8).save_pretrained(shipped[0] / "spread-trapper.safetensors")
+    with pytest.raises(WeightsError, match=r"forecaster of .*no weights .*forecaster-trapper-noisy"):
+        DynamicPlanner.from_pretrained("trapper-ik-wait_and_drop")
+    noisy = Forecaster(hidden=8, channels=4, tracked=True), SpreadNetwork(features=8, tracked=True)
+    for network in noisy:
+        network.save_pretrained(shipped[0] / f"{network.kind}-trapper-noisy.safetensors")
     planner = DynamicPlanner.from_pretrained("trapper-ik-wait_and_drop", chunk=4)
-    assert isinstance(planner.forecaster, SpreadForecaster)
+    assert isinstance(planner.forecaster.exact, SpreadForecaster)
+    assert isinstance(planner.forecaster.noisy, SpreadForecaster)
     assert (planner.search, planner.maneuver) == (waiting_search(SCENE), WaitAndDrop.of(SCENE))
     assert (planner.schedule, planner.chunk) == (ReplanSchedule.every(5, first_step=13), 4)
     with torch.no_grad():

@@ -6,6 +6,7 @@ from tensordict import TensorDict
 
 from tests.planners.toy import HISTORY, ToyEnv, assert_same, make_planner, observation
 from torchdyn_plan import keys
+from torchdyn_plan.envs import Sensor, TrapperEnv
 from torchdyn_plan.errors import InputError
 from torchdyn_plan.planners import (
     CallablePlanner,
@@ -195,3 +196,27 @@ def test_the_history_is_as_long_as_the_forecaster_reads():
     assert TrackedPlanner(planner, TRACK, control_step=STEP).history == 7
     assert TrackedPlanner(make_planner(), TRACK, control_step=STEP).history == 24
     assert tracked(planner).history == HISTORY
+
+
+def test_the_planner_that_ships_sees_noisy_targets_by_another_forecaster(tmp_path):
+    """From the second measurement on; saved and loaded it is the same, and without noise it is the planner itself."""
+    inner = DynamicPlanner.from_pretrained("trapper-ik-wait_and_drop")
+    exact = TrackedPlanner(inner, KalmanTrack(noise=1e-4), control_step=0.004)
+    assert exact.planner is inner
+    assert exact.history == 24
+    planner = TrackedPlanner(inner, KalmanTrack(noise=0.005), control_step=0.004)
+    assert planner.planner.forecaster is inner.forecaster.noisy
+    assert planner.history == 48
+    planner.save_pretrained(tmp_path)
+    loaded = TrackedPlanner.from_pretrained(tmp_path)
+    sensor = Sensor(noise=0.005, rate=125.0)
+    rolls = []
+    for made in (planner, loaded):
+        env = TrapperEnv(num_envs=2, velocity=3.0, seed=0, split="dev", sensor=sensor, num_threads=1)
+        with torch.no_grad():
+            rolls.append(env.rollout(6, made, break_when_any_done=False))
+    assert torch.equal(rolls[0]["action"], rolls[1]["action"])
+    status = rolls[0]["plan", "status"]
+    assert (status[:, :2] == int(PlanStatus.NO_TRACK)).all()
+    assert rolls[0]["plan", "replans"][:, 1].sum() == 0
+    assert (rolls[0]["plan", "replans"][:, 2] == 1).all()
