@@ -144,3 +144,13 @@ def test_what_cannot_choose_is_named():
         act(planner_of(), observation(PLACES, VELOCITY, step=0).exclude("targets_history"))
     with pytest.raises(InputError, match="targets_pos must have shape"):
         act(planner_of(), observation(PLACES, VELOCITY, step=0).set("targets_pos", PLACES[:, :2]))
+
+
+def test_a_batch_of_any_shape_is_a_loop_over_its_rows():
+    noise = 0.3 * torch.randn(2, 3, 3, 2, generator=torch.Generator().manual_seed(0))
+    places, velocity = PLACES[:1].unsqueeze(1) + noise, VELOCITY[:1].unsqueeze(1) - noise
+    flat = observation(places.flatten(0, 1), velocity.flatten(0, 1), step=0)
+    expected = act(planner_of(), flat.clone())
+    found = act(planner_of(), flat.clone().view(2, 3).to_tensordict())
+    assert torch.equal(found["plan", "choice_target"].flatten(), expected["plan", "choice_target"])
+    assert torch.equal(found["action"].flatten(0, 1), expected["action"])

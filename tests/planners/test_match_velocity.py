@@ -194,3 +194,17 @@ def test_an_axis_of_another_space_is_named():
         flat.search()
     with pytest.raises(InputError, match="axis has 2 numbers, but places have 3 coordinates"):
         run(make_planner(MANEUVER).with_parts(maneuver=flat), BELT, SPEEDS, steps=3)
+
+
+def test_who_hovers_upstream_is_as_exact_and_goes_less_far_back():
+    early = MatchVelocity(hover=HOVER, descent_steps=DESCENT, hold_steps=HOLD, early_steps=6)
+    assert early.search().early_steps == 6
+    tool, target, _, phase = run(make_planner(early), BELT[:2], SPEEDS[:2])
+    here = contact(phase)
+    assert (at(tool, here) - at(target, here)).norm(dim=-1).max() < 2e-3
+    plain = run(make_planner(), BELT[:2], SPEEDS[:2])
+
+    def back(tool):
+        return -tool[..., 0].diff(dim=1).clamp(max=0.0).sum(1)
+
+    assert (back(tool) < back(plain[0]) + 0.01).all()

@@ -357,3 +357,14 @@ def test_coarse_to_fine_works_on_short_forecasts(horizon):
     forecast, here = paths(30, horizon=horizon)
     found, whole = (meet(ExactSearch(stride=2, coarse=n), forecast, here, robot()[0]) for n in (4, 1))
     assert bool(same(found, whole)[whole.reachable].all())
+
+
+def test_a_tool_waits_where_the_target_is_some_steps_before_they_meet():
+    path, here = line((1.0, 0.2), (-0.004, 0.0))
+    eta, _ = robot(reach=3.0)
+    found = meet(ExactSearch(stride=1, first=1, early_steps=12), path, here, eta)
+    plain = meet(ExactSearch(stride=1, first=1), path, here, robot(reach=3.0)[0])
+    assert torch.equal(found.goal, path[found.arrival_steps - 1 - 12])
+    # It is there in time, but no sooner than it must: the place is farther up than that of the meeting.
+    assert eta(found.goal.unsqueeze(0), estimator="mode").steps <= found.arrival_steps
+    assert plain.arrival_steps < found.arrival_steps <= plain.arrival_steps + 12

@@ -11,6 +11,7 @@ from torchdyn_plan.envs.conveyor.env import draw_parts
 from torchdyn_plan.envs.conveyor.panda import PANDA_LINKS, TOOL_TURN
 from torchdyn_plan.errors import InputError
 from torchdyn_plan.evaluation import evaluate
+from torchdyn_plan.planners import ChoosingPlanner
 from torchdyn_plan.tasks import load_task
 from torchdyn_plan.tasks.conveyor.solvable import parts_solvable
 
@@ -145,3 +146,17 @@ def test_a_scene_that_is_none_is_refused(change, message):
 def test_settings_that_cannot_be_are_refused(settings):
     with pytest.raises(InputError, match=next(iter(settings))):
         ConveyorEnv(**settings)
+
+
+def test_its_planner_is_saved_and_loaded(tmp_path):
+    planner = TASK.planner("meet")
+    planner.save_pretrained(tmp_path)
+    again = ChoosingPlanner.from_pretrained(tmp_path)
+    env = ConveyorEnv(2, seed=0, split="dev", num_threads=1)
+    seen = env.rollout(3, planner)[:, -1].exclude("plan", "next").set("step_count", torch.zeros(2, 1).long())
+    with torch.no_grad():
+        one, other = planner(seen.clone()), again(seen.clone())
+    assert torch.equal(one["goal_pose"], other["goal_pose"])
+    assert torch.equal(one["action"], other["action"])
+    assert again.planner.turn == planner.planner.turn
+    assert again.planner.static.acceleration == planner.planner.static.acceleration
