@@ -137,7 +137,8 @@ class Controls:
         first = self._first
         numbers: dict[str, Any] = {name: slider.value for name, slider in self._sensor.items()}
         # No rate is one measurement at each control step.
-        sensor = Sensor(**(numbers | {"rate": numbers["rate"] or None}))
+        numbers["rate"] = numbers["rate"] or None
+        sensor = Sensor(**numbers)
         settings = {name: handle.value for name, handle in self._settings.items()}
         changes: dict[str, Any] = {
             "static": self._static.value,
