@@ -187,7 +187,8 @@ class InferenceForecaster(Precise, DescribedForecast):
         step, now = history[:, 1:] - history[:, :-1], history[:, -1]
         if config.stride > 1:
             step.mul_(1.0 / config.stride)
-        line, hidden = self._line(step, now, step[:, -1], *self._known(target_covariance))
+        known = () if target_covariance is None or not config.tracked else (self._known(target_covariance),)
+        line, hidden = self._line(step, now, step[:, -1], *known)
         if config.half_extent is not None:
             level = line[:, :2]
             level.sub_(level.round()).abs_()
@@ -223,13 +224,11 @@ class InferenceForecaster(Precise, DescribedForecast):
         scale, shape = scale.reshape(*batch, horizon, 2), shape.reshape(*batch, horizon, 2)
         return Spread(scale, shape, gone.view(*batch, horizon))
 
-    def _known(self, target_covariance: Tensor | None) -> tuple[Tensor, ...]:
-        """What is known of position and velocity, ``(R, 3)``, by their covariance (*B, 2, 2); nothing if not read."""
-        if target_covariance is None or not self.config.tracked:
-            return ()
+    def _known(self, target_covariance: Tensor) -> Tensor:
+        """Inputs ``(R, 3)`` for how well position and velocity are known, by their covariance (*B, 2, 2)."""
         from torchdyn_plan.nets.forecaster import how_well_known
 
-        return (how_well_known(target_covariance.to(self.head_weight).reshape(-1, 2, 2)),)
+        return how_well_known(target_covariance.to(self.head_weight).reshape(-1, 2, 2))
 
     def _line(self, step: Tensor, now: Tensor, newest: Tensor, *known: Tensor) -> tuple[Tensor, Tensor]:
         """Unreflected line (R, 3, F) and hidden features; with cushions x and y count in periods of the reflection."""

@@ -23,17 +23,17 @@ from torchdyn_plan.planners.protocol import read
 from torchdyn_plan.planners.rows import apply_to_rows
 from torchdyn_plan.planners.schedule import lateness
 from torchdyn_plan.planners.search.meeting import SearchContext, later
+from torchdyn_plan.planners.turn import Turn
 from torchdyn_plan.precision import HALVES
 
 
 class DynamicPlanner(ComposedPlanner):
-    """Meets a moving target: history → forecast → meeting → goal → action.
+    """Meets a moving target: history → forecast → meeting → goal → action. `ComposedPlanner` describes its parts.
 
     Writes ``goal`` (*B, 3 or 2) [m, world], ``arrival_steps`` (*B,), what the static planner writes, and under ``plan``
     the memory for the next step and each row's `PlanStatus`. A row plans when its schedule says so, and restarts at
-    ``step_count`` 0. A row that cannot plan, because its input or forecast is NaN or infinite or its target is lost,
-    holds its tool still and tries again at each step. A row with a bad robot state gets action 0.
-    Parts: see `ComposedPlanner`.
+    ``step_count`` 0. A row whose input or forecast is NaN or infinite, or whose target is lost, holds its tool still
+    and tries again at each step; one with a bad robot state gets action 0.
     """
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
@@ -66,11 +66,7 @@ class DynamicPlanner(ComposedPlanner):
         goal, state = self.maneuver(plan, obs, holds, state)
         status = plan.status(trouble, ticked.replans)
         self.memory.remember(tensordict, (ticked, plan, state, pending), replanned=planned, status=status)
-        if self.turn is not None:
-            tensordict.set(keys.GOAL_POSE, goal)
-            goal = goal[..., :3]
-        tensordict.set(keys.GOAL, goal)
-        tensordict.set(keys.ARRIVAL_STEPS, plan.arrival_steps)
+        write_goal(tensordict, goal, plan.arrival_steps, turned=self.turn is not None)
         return self.static(tensordict) if found.blind is None else act(self.static, tensordict, found.blind)
 
     def replan(self, observation: Observation, plan: Plan) -> Plan:
@@ -79,20 +75,34 @@ class DynamicPlanner(ComposedPlanner):
         forecaster, eta_model = self.forecaster, self.eta
         if self.prepared is not None and self.prepared.stands_for(observation.robot_state, *observation.seen):
             forecaster, eta_model = self.prepared.copies
-        count = len(self.forecaster.in_keys)
-        forecast = forecaster.predict(*observation.seen[:count])
+        forecast = forecaster.predict(*observation.seen[: len(self.forecaster.in_keys)])
         path, usable = usable_path(forecast.path, observation.target_pos)
-        turn = None if self.turn is None else self.turn(path, observation.target_pos, *observation.seen[count:])
+        turn = None if self.turn is None else turn_after(delay, self.turn, path, observation)
         forecast, target_pos = Forecast(path, forecast.spread), observation.target_pos
         eta, planned_steps = eta_model.from_state(observation.robot_state), plan.arrival_steps
         if delay:
             # From here on, times count from the moment at which the plan becomes available.
             forecast, eta = forecast.after(delay), later(eta, delay)
             target_pos, planned_steps = path[..., delay - 1, :], (planned_steps - delay).clamp_min(0)
-            turn = None if turn is None else turn[..., delay:, :]
         context = SearchContext(observation.tool_pos, planned_steps, self.lost, turn)
         meeting = self.search(forecast, target_pos, eta, context)
         return Plan.make(meeting, usable, target_pos, forecast.path, self.memory.path_length)
+
+
+def turn_after(delay: int, turn: Turn, path: Tensor, observation: Observation) -> Tensor:
+    """Orientations (*B, F - delay, 4) along a forecast ``path`` (*B, F, 3), from ``delay`` control steps on."""
+    # What the forecaster reads comes first.
+    seen = observation.seen[len(observation.seen) - len(turn.in_keys) :]
+    return turn(path, observation.target_pos, *seen)[..., delay:, :]
+
+
+def write_goal(tensordict: TensorDictBase, goal: Tensor, arrival_steps: Tensor, *, turned: bool) -> None:
+    """Write a goal (*B, 3 or 2), or the pose (*B, 7) of one that is ``turned``, and when the robot is to be there."""
+    if turned:
+        tensordict.set(keys.GOAL_POSE, goal)
+        goal = goal[..., :3]
+    tensordict.set(keys.GOAL, goal)
+    tensordict.set(keys.ARRIVAL_STEPS, arrival_steps)
 
 
 def observe(tensordict: TensorDictBase, forecaster: ForecastModel, besides: Sequence[Any] = ()) -> Observation:
