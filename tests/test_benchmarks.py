@@ -101,7 +101,7 @@ def test_a_planning_step_goes_through_few_calls_in_few_files(study):
     between = count_calls.count(followed["wait_and_drop, a step between plans"])
     assert 40 < plans["calls"] <= 60, plans
     assert plans["files"] <= 12, plans
-    assert 20 < between["calls"] <= 30, between
+    assert 20 < between["calls"] <= 31, between
 
 
 TORTURE = {
