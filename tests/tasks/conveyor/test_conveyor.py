@@ -6,6 +6,7 @@ import pytest
 import torch
 from torchrl.envs.utils import check_env_specs
 
+from torchdyn_plan.envs import Sensor
 from torchdyn_plan.envs.conveyor import ConveyorEnv, ConveyorScene, panda_arm
 from torchdyn_plan.envs.conveyor.env import draw_parts
 from torchdyn_plan.envs.conveyor.panda import PANDA_LINKS, TOOL_TURN
@@ -142,7 +143,7 @@ def test_a_scene_that_is_none_is_refused(change, message):
         ConveyorScene(**change)
 
 
-@pytest.mark.parametrize("settings", [{"parts": 0}, {"parts": 9}, {"speed": -0.1}])
+@pytest.mark.parametrize("settings", [{"parts": 0}, {"parts": 9}, {"speed": -0.1}, {"sensor": Sensor(noise=0.01)}])
 def test_settings_that_cannot_be_are_refused(settings):
     with pytest.raises(InputError, match=next(iter(settings))):
         ConveyorEnv(**settings)

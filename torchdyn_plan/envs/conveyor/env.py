@@ -16,6 +16,8 @@ from torchdyn_plan.envs.conveyor.simulation import ConveyorSimulation
 from torchdyn_plan.envs.episodes import draw_uniform
 from torchdyn_plan.envs.moving_target import MovingTargetEnv, RobotReading
 from torchdyn_plan.envs.painter import Painter
+from torchdyn_plan.envs.sensor import Sensor
+from torchdyn_plan.errors import InputError
 
 if TYPE_CHECKING:
     import numpy as np
@@ -81,7 +83,13 @@ class ConveyorEnv(MovingTargetEnv):
             scene: geometry and physics.
             num_threads: native threads of the simulation, 0 for all cores.
             series: as of `MovingTargetEnv`.
+
+        Raises:
+            InputError: a number is out of range, or there is a sensor: one measures one target, and here all are seen.
         """
+        sensor = series.get("sensor")
+        if isinstance(sensor, Sensor) and not sensor.is_exact:
+            raise InputError("sensor must be None: it measures one target, and the places of all parts are shown here")
         check_number("speed", speed, minimum=0.0, maximum=2.0)
         check_number("parts", parts, minimum=1, maximum=MOST_PARTS, integer=True)
         scene = ConveyorScene() if scene is None else scene
