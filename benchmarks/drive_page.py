@@ -109,7 +109,7 @@ def drive(driver: Driver, arguments: Arguments) -> None:
     def shows(*planners: str) -> bool:
         return tuple(recording.scenario.planner for recording in page.recordings) == planners
 
-    driver.tab.get_by_text("Playback").wait_for(timeout=1000 * PATIENCE)
+    driver.tab.get_by_text("Playback").wait_for()
     driver.until("recorded", lambda: shows(first))
     driver.until("plays", lambda: page.step > 5)
     driver.until("played to the end", lambda: page.step >= page.length and not page.playing)
@@ -143,6 +143,7 @@ def main(arguments: Arguments) -> None:
         with sync_playwright() as playwright:
             browser = playwright.chromium.launch(executable_path=arguments.chromium, args=FLAGS.split())
             tab = browser.new_page(viewport={"width": 1280, "height": 720})
+            tab.set_default_timeout(1000 * PATIENCE)
             tab.goto(page.address)
             # What viser says of drawing by software is about this machine.
             tab.add_style_tag(content="[class*=Notification] { display: none !important }")

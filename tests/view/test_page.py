@@ -76,16 +76,16 @@ def test_it_plays_stops_at_the_end_steps_and_scrubs(served):
 
 def test_another_planner_and_one_beside_it(served):
     until(lambda: shows(served, "pursuit"))
-    served.controls._left.value = "meet"
-    until(lambda: shows(served, "meet"))
-    served.controls._right.value = "corner"
-    until(lambda: shows(served, "meet", "corner"))
+    served.controls._left.value = "corner"
+    until(lambda: shows(served, "corner"))
+    served.controls._right.value = "pursuit"
+    until(lambda: shows(served, "corner", "pursuit"))
     served.controls._settings["speed"].value = 0.4
     until(lambda: served.recordings[0].scenario.chosen.speed == 0.4)
     served.go_to(served.length)
     assert served.controls._said.content.count("met after") == 2
     served.controls._right.value = "none"
-    until(lambda: shows(served, "meet"))
+    until(lambda: shows(served, "corner"))
 
 
 def test_a_sensor_and_its_track_are_chosen_on_the_page(served):

@@ -21,7 +21,7 @@ CHASE = load_task("chase")
 
 @pytest.fixture(scope="module")
 def recording():
-    return record_episode(Scenario(task=CHASE, planner="meet", episode=2, sensor=Sensor(rate=20.0, noise=0.01)))
+    return record_episode(Scenario(task=CHASE, planner="corner", episode=2, sensor=Sensor(rate=20.0, noise=0.01)))
 
 
 @pytest.fixture(scope="module")
@@ -64,12 +64,11 @@ def test_layers_have_as_many_marks_at_every_step(recording):
             assert ((marks.colours >= 0.0) & (marks.colours <= 1.0)).all()
 
 
-def test_nothing_of_a_plan_is_seen_before_the_first():
-    late = record_episode(Scenario(task=CHASE, planner="corner", episode=2))
-    assert late.insight(0) is None
+def test_nothing_of_a_plan_is_seen_before_the_first(exact):
+    assert exact.insight(0) is None
     for name in ("region", "forecast", "candidates"):
-        assert (marks_at(late, 0)[name].colours[:, 3] == 0.0).all()
-        assert (marks_at(late, 20)[name].colours[:, 3] > 0.0).any()
+        assert (marks_at(exact, 0)[name].colours[:, 3] == 0.0).all()
+        assert (marks_at(exact, 20)[name].colours[:, 3] > 0.0).any()
 
 
 def test_candidates_are_blue_where_the_robot_is_early_and_orange_where_it_is_late():

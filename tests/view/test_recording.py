@@ -121,8 +121,8 @@ def test_a_planner_without_plans_has_none():
 
 
 def test_measurements_and_track_are_kept():
-    held = record_episode(chase(sensor=CAMERA, episode=2))
-    tracked = record_episode(chase(sensor=CAMERA, track=KalmanTrack(noise=0.05), episode=2))
+    held = record_episode(chase("corner", sensor=CAMERA, episode=2))
+    tracked = record_episode(chase("corner", sensor=CAMERA, track=KalmanTrack(noise=0.05), episode=2))
     for recording in (held, tracked):
         came = np.isfinite(recording.measured_pos).all(-1).any(-1)
         assert came.sum() == pytest.approx(recording.length * CHASE.control_step * CAMERA.rate, abs=2)
