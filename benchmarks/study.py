@@ -14,12 +14,11 @@ from contextlib import contextmanager
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import torch
 from tqdm import tqdm
 
-from torchdyn_plan.envs.sensor import Sensor
 from torchdyn_plan.evaluation.episodes import find_truth, run_episodes
 from torchdyn_plan.evaluation.intervals import paired_loss, rate
 from torchdyn_plan.evaluation.results import EpisodeOutcomes
@@ -27,6 +26,10 @@ from torchdyn_plan.files import write_json
 from torchdyn_plan.tasks import Task, Truth
 from torchdyn_plan.threads import one_thread
 from torchdyn_plan.versions import library_versions, machine
+
+if TYPE_CHECKING:
+    # Not where it runs: sides of a comparison import this module with a former package, which may have no sensors.
+    from torchdyn_plan.envs.sensor import Sensor
 
 Row = dict[str, Any]
 

@@ -3,8 +3,6 @@
 import importlib
 import importlib.util
 import json
-import subprocess
-import sys
 from pathlib import Path
 
 import pytest
@@ -14,7 +12,7 @@ from torchdyn_plan.tasks import load_task
 
 BENCHMARKS = Path(__file__).parent.parent / "benchmarks"
 SMALL = {
-    "ablation": "--velocities 3 --episodes 2 --num-envs 2 --split dev",
+    "ablation": "--velocities 5 --episodes 2 --num-envs 2 --split dev",
     "braking": "--episodes 2 --num-envs 2 --threads 1",
     "arrival_time": "--batches 2 --cases 3 --seconds 0.01",
     "chase": "--rows 8",
@@ -22,10 +20,10 @@ SMALL = {
     "ceiling": "--velocities 5 --episodes 3 --spacing 60 --meetings 1 --leads 7 --rows 64 --split dev",
     "count_calls": "--planners corner --batch 2",
     "diagnose": "--velocities 3 --episodes 4 --arrivals network --split dev",
-    "following": "--arms ur5 --paths 2 --steps 6 --former .",
+    "following": "--arms ur5 --paths 2 --steps 6",
     "forecast_gain": "--episodes 2 --seeds 0 --velocity 5",
     "former_latency": "--former . --planners corner --statics ik --processes 1 --rounds 1 --seconds 0.01 --calls plan",
-    "inverse": "--arms ur5 --poses 4 --repeats 1 --former .",
+    "inverse": "--arms ur5 --poses 4 --repeats 1",
     "kinematics_beside": "--former . --batches 1 --seconds 0.01 --no-compiled --no-rivals --repeats 1",
     "joint_speeds": "--episodes 4 --num-envs 4",
     "loops": "--planners corner --episodes 4 --steps 30 --loops rollout",
@@ -35,7 +33,7 @@ SMALL = {
     "reach_env": "--copies 2 --steps 4 --threads 1",
     "recovery": "--planners wait_and_drop --statics ik --velocities 5 --episodes 2 --num-envs 2 --split dev",
     "schedules": "--planners wait_and_drop --velocities 3 --schedules paper --episodes 4",
-    "sensors": "--velocities 3 --episodes 2 --num-envs 2 --planners untrained --tracks kalman held",
+    "sensors": "--sensors exact --velocities 5 --episodes 2 --num-envs 2 --planners untrained --tracks kalman held",
     "static_task": "--episodes 8 --split dev",
     "worst_case": "--planners corner --statics ik --calls 40 --seconds 1",
     "track": "--batches 1 2 --seconds 0.01",
@@ -56,7 +54,22 @@ PARTS = {"arms", "former_latency_side", "sides", "study"}
 """No scripts of their own."""
 
 
-@pytest.mark.parametrize("name", SMALL)
+LONG = {
+    "ablation",
+    "braking",
+    "calibration",
+    "following",
+    "forecast_gain",
+    "former_latency",
+    "inverse",
+    "kinematics_beside",
+    "latency",
+    "worst_case",
+}
+"""Five to twenty seconds each: `make check` runs them; those that `make test` runs use the same harness."""
+
+
+@pytest.mark.parametrize("name", [pytest.param(name, marks=[pytest.mark.slow] * (name in LONG)) for name in SMALL])
 def test_benchmark_runs(name, tmp_path):
     if name.startswith("reach") and importlib.util.find_spec("gymnasium_robotics") is None:
         pytest.skip("gymnasium-robotics has the arm")
@@ -100,8 +113,9 @@ TORTURE = {
 
 
 def torture(*words):
-    run = [sys.executable, "-m", "benchmarks.torture", *words]
-    return subprocess.run(run, cwd=BENCHMARKS.parent, capture_output=True, text=True, check=False, timeout=500)
+    module = "import runpy, sys\nsys.path.insert(0, '')\n"
+    module += "runpy.run_module('benchmarks.torture', run_name='__main__', alter_sys=True)"
+    return run(module, *words, cwd=BENCHMARKS.parent, timeout=500, OMP_NUM_THREADS="1")
 
 
 def test_promises_are_tried_and_a_killed_run_goes_on(tmp_path):

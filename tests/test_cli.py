@@ -10,6 +10,7 @@ from pathlib import Path
 import pytest
 import torch
 
+from tests.scripts import run
 from torchdyn_plan import cli, tasks
 from torchdyn_plan.cli.output import say
 from torchdyn_plan.envs import TrapperEnv, TrapperScene
@@ -375,15 +376,15 @@ def test_bench_replan_prints_and_writes_the_planners_that_are_named(tmp_path, ca
 def test_a_bench_that_is_killed_has_written_what_it_measured(tmp_path):
     out = tmp_path / "figures.json"
     words = f"bench replan --planner corner --batches 1 --seconds 2 --out {out}".split()
-    run = subprocess.Popen(
+    killed = subprocess.Popen(
         [sys.executable, "-c", "from torchdyn_plan.cli import main; main()", *words],
         stdout=subprocess.PIPE,
         stderr=subprocess.DEVNULL,
         text=True,
     )
-    first = run.stdout.readline()
-    run.kill()
-    run.communicate()
+    first = killed.stdout.readline()
+    killed.kill()
+    killed.communicate()
     content = json.loads(out.read_text())
     assert first.startswith(f"what {content['rows'][0]['what']} ")
     assert len(content["rows"]) in {1, 2}
@@ -438,35 +439,38 @@ def test_a_killed_sweep_continues_and_ends_as_one_that_was_not(tmp_path, monkeyp
     assert "holds a sweep with another configuration: friction is 0.0 there, 1.0 here" in err
 
 
+EVALUATES = "evaluate --planners pursuit --episodes 2 --num-envs 2 --split dev --threads 1 --out results"
+TO_NOBODY = """
+import os, sys
+read, write = os.pipe()
+os.close(read)
+sys.stdout = open(write, "w")
+"""
+# Whatever another encoding lacks, this one does.
+TO_ASCII = """
+import sys
+sys.stdout.reconfigure(encoding="ascii", errors="strict")
+"""
+MAIN = """
+from torchdyn_plan.cli import main
+main()
+"""
+
+
 def test_results_are_saved_though_nobody_reads_the_table(tmp_path):
-    words = f"evaluate --planners pursuit --episodes 2 --num-envs 2 --split dev --threads 1 --out {tmp_path}".split()
-    run = subprocess.Popen(
-        [sys.executable, "-c", "from torchdyn_plan.cli import main; main()", *words],
-        stdout=subprocess.PIPE,
-        stderr=subprocess.PIPE,
-        text=True,
-    )
-    run.stdout.close()
-    errors = run.stderr.read()
-    assert run.wait(120) == 0, errors
-    assert "Traceback" not in errors
-    assert "BrokenPipe" not in errors
-    assert {"results.json", "episodes.json", "results.png"} <= {file.name for file in tmp_path.iterdir()}
+    done = run(TO_NOBODY + MAIN, *EVALUATES.split(), cwd=tmp_path)
+    assert done.returncode == 0, done.stderr
+    assert "Traceback" not in done.stderr
+    assert "BrokenPipe" not in done.stderr
+    assert {"results.json", "episodes.json", "results.png"} <= {file.name for file in (tmp_path / "results").iterdir()}
 
 
 def test_a_terminal_without_our_signs_still_gets_the_table(tmp_path):
-    # Whatever another encoding lacks, this one does.
-    words = f"evaluate --planners pursuit --episodes 2 --num-envs 2 --split dev --threads 1 --out {tmp_path}".split()
-    run = subprocess.run(
-        [sys.executable, "-c", "from torchdyn_plan.cli import main; main()", *words],
-        env={**os.environ, "PYTHONIOENCODING": "ascii"},
-        capture_output=True,
-        check=False,
-        timeout=120,
-    )
-    assert run.returncode == 0, run.stderr
-    assert b"pursuit" in run.stdout
-    assert (tmp_path / "results.json").is_file()
+    done = run(TO_ASCII + MAIN, *EVALUATES.split(), cwd=tmp_path)
+    assert done.returncode == 0, done.stderr
+    assert "pursuit" in done.stdout
+    assert done.stdout.isascii()
+    assert (tmp_path / "results" / "results.json").is_file()
 
 
 @pytest.mark.skipif(find_spec("ray") is not None, reason="Ray is here")

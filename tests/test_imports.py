@@ -2,6 +2,7 @@ import ast
 import subprocess
 import sys
 from collections.abc import Iterator
+from functools import cache
 from pathlib import Path
 
 import pytest
@@ -86,6 +87,7 @@ def general_files() -> list[Path]:
     return sorted(set(files) - FACES)
 
 
+@cache
 def names_of_tasks() -> set[str]:
     """Names of tasks, and of the classes and constants that their folders define."""
     found = set(TASKS)

@@ -60,5 +60,6 @@ def test_without_a_compiler_the_error_says_so(tmp_path):
         "except CompileError as error: print(error)"
     )
     environment = {**os.environ, "CXX": "no-such-compiler", "TORCHINDUCTOR_CACHE_DIR": str(tmp_path)}
+    environment |= {"TORCHINDUCTOR_COMPILE_THREADS": "1"}
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False, env=environment)
     assert "cannot be compiled; it needs a working C++ compiler" in done.stdout, done.stderr

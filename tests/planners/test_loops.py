@@ -102,8 +102,8 @@ LOOPS = {
 }
 
 
-# What workers are made by has to do with no part of a planner: one that remembers most is enough.
-CASES = [(loop, parts) for loop in LOOPS for parts in PARTS if loop != "EnvCreator" or parts == "late"]
+# How processes and collectors carry a memory has to do with no part of a planner: one that remembers most is enough.
+CASES = [(loop, parts) for loop in LOOPS for parts in PARTS if loop in {"SerialEnv", "compiled"} or parts == "late"]
 
 
 @pytest.mark.parametrize(("loop", "parts"), CASES)

@@ -373,6 +373,13 @@ def put(part, value):
     return edit
 
 
+def put_spread(value):
+    def edit(content):
+        content["parts"]["forecaster"]["settings"]["spread"] = value
+
+    return edit
+
+
 def network_of(path):
     return put("eta", {"network": path, "file": "eta.safetensors"})
 

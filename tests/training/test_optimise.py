@@ -37,7 +37,7 @@ def fit(out, *, steps=40, fail_at=None, nan_at=None, resume=True, settings=None,
 
 
 def test_it_learns_and_records(tmp_path):
-    network, curve, _ = fit(tmp_path, steps=400)
+    network, curve, _ = fit(tmp_path, steps=400, checkpoint_seconds=60.0)
     torch.testing.assert_close(network.weight, torch.ones(1, 3), atol=1e-2, rtol=0)
     assert [entry["step"] for entry in curve] == [100, 200, 300, 400]
     assert curve[-1]["loss"] < 1e-3 < curve[0]["loss"]
@@ -47,7 +47,7 @@ def test_it_learns_and_records(tmp_path):
 
 @pytest.mark.parametrize("fail_at", [1, 2, 17, 33])
 def test_an_interrupted_fit_ends_bit_identical(tmp_path, fail_at):
-    whole, whole_curve, _ = fit(tmp_path / "whole")
+    whole, whole_curve, _ = fit(tmp_path / "whole", checkpoint_seconds=60.0)
     with pytest.raises(KeyboardInterrupt):
         fit(tmp_path / "cut", fail_at=fail_at)
     rest, rest_curve, calls = fit(tmp_path / "cut")

@@ -93,8 +93,10 @@ class SpreadForecaster(ForecastModel):
     """A forecaster that also says how far it may be off."""
 
     def __init__(self, forecaster: DescribedForecast, spread: SpreadNetwork) -> None:
-        """Judge the paths of ``forecaster`` by ``spread``, which was fitted to its errors."""
+        """Judge the paths of ``forecaster`` by ``spread``, which was fitted to its errors; `InputError` if it is none."""
         super().__init__()
+        if not isinstance(spread, SpreadNetwork):
+            raise InputError(f"spread is {type(spread).__name__}, expected a SpreadNetwork")
         self.forecaster, self.spread, self.history = forecaster, spread, forecaster.history
 
     def predict(self, *seen: Tensor) -> Forecast:

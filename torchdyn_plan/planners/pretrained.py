@@ -96,15 +96,15 @@ class PretrainedPlanner:
         made = {name: parts[name] if name in parts else load.part(name, value) for name, value in described.items()}
         try:
             planner: Any = cls(**made)
+            # A part that is not described would be the default one without a word.
+            missing = sorted(planner.part_settings().keys() - made.keys())
+            if missing:
+                raise WeightsError(f"{str(file)!r} lacks {', '.join(missing)}")
+            return _ready(planner.to(device), parts)
         except (TypeError, ValueError, AttributeError, RuntimeError) as error:
-            if isinstance(error, InputError) and parts:
+            if isinstance(error, WeightsError) or (isinstance(error, InputError) and parts):
                 raise
             raise WeightsError(f"{str(file)!r} describes no planner that can be made: {error}") from error
-        # A part that is not described would be the default one without a word.
-        missing = sorted(planner.part_settings().keys() - made.keys())
-        if missing:
-            raise WeightsError(f"{str(file)!r} lacks {', '.join(missing)}")
-        return _ready(planner.to(device), parts)
 
 
 def _save(network: Pretrained, folder: Path, written: dict[int, str]) -> str:

@@ -254,7 +254,8 @@ class IKPlanner(Precise, StaticPlannerModule):
         """`step` of rows in one compiled loop; rows that push a joint beyond its limits are solved again."""
         assert self._fused is not None
         action, reached, pushed = self._fused(joint_pos, goal)
-        if pushed.sum().item():
+        # A row alone is read as it is: a sum would take a tenth of the step.
+        if (pushed if pushed.numel() == 1 else pushed.sum()).item():
             rows = pushed.squeeze(-1).nonzero().squeeze(-1)
             joint_pos, goal = joint_pos[rows], goal[rows]
             action[rows], reached[rows] = self._step_from(joint_pos, goal, *evaluate(self.arm, joint_pos))
