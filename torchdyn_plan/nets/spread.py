@@ -93,7 +93,7 @@ class SpreadForecaster(ForecastModel):
     """A forecaster that also says how far it may be off."""
 
     def __init__(self, forecaster: DescribedForecast, spread: SpreadNetwork) -> None:
-        """Judge the paths of ``forecaster`` by ``spread``, which was fitted to its errors; `InputError` if it is none."""
+        """Judge the paths of ``forecaster`` by ``spread``, fitted to its errors; raises `InputError` if it is none."""
         super().__init__()
         if not isinstance(spread, SpreadNetwork):
             raise InputError(f"spread is {type(spread).__name__}, expected a SpreadNetwork")
