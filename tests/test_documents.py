@@ -186,3 +186,12 @@ def test_there_are_two_notebooks():
 
 def test_readme_fits_on_a_few_screens():
     assert len((ROOT / "README.md").read_text().splitlines()) <= 120
+
+
+def test_the_version_is_the_same_everywhere():
+    version = importlib.import_module("torchdyn_plan").__version__
+    assert f'\nversion = "{version}"\n' in (ROOT / "pyproject.toml").read_text()
+    assert f"\nversion: {version}\n" in (ROOT / "CITATION.cff").read_text()
+    (first, date) = re.findall(r"^## (\S+) \((\S+)\)$", (ROOT / "CHANGELOG.md").read_text(), re.MULTILINE)[0]
+    assert first == version
+    assert f'\ndate-released: "{date}"\n' in (ROOT / "CITATION.cff").read_text()

@@ -14,7 +14,7 @@ if TYPE_CHECKING:
     from torchdyn_plan.training.collect import collect
     from torchdyn_plan.training.train import train
 
-__version__ = "0.2.0.dev0"
+__version__ = "0.2.0"
 
 __all__ = [
     "DynamicPlanner",
