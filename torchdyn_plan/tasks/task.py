@@ -316,10 +316,8 @@ class PlannerParts:
             names = [self.weights / f"{NOISY}{kind}" for kind in ("forecaster", "spread")]
             if not all(folder.is_dir() for folder in names):
                 return self.spread_forecaster
-        forecaster, spread = (
-            kind.from_pretrained(name).requires_grad_(False)
-            for kind, name in zip((Forecaster, SpreadNetwork), names, strict=True)
-        )
+        forecaster = Forecaster.from_pretrained(names[0]).requires_grad_(False)
+        spread = SpreadNetwork.from_pretrained(names[1]).requires_grad_(False)
         return ForecastByNoise(self.spread_forecaster, SpreadForecaster(forecaster, spread)).eval()
 
     @property

@@ -96,7 +96,9 @@ def spread_loss(forecaster: Forecaster, network: SpreadNetwork, windows: Windows
     log_scale, log_shape, gone = network.raw(features, swapped)
     beyond = error.log() - log_scale
     if forecaster.config.tracked:
-        score = sum(_pinball(beyond - math.log(share / (1.0 - share)) / log_shape.exp(), share) for share in QUANTILES)
+        wide = log_shape.exp()
+        parts = [_pinball(beyond - math.log(share / (1.0 - share)) / wide, share) for share in QUANTILES]
+        score = torch.stack(parts).sum(0)
     else:
         beyond = log_shape.exp() * beyond
         score = 2.0 * softplus(-beyond) + beyond - log_shape

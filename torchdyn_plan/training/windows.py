@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor
@@ -51,8 +51,8 @@ class Windows(NamedTuple):
     @classmethod
     def joined(cls, parts: Sequence[Windows]) -> Windows:
         """All of them, one after the other; either all or none were seen by a track."""
-        fields = zip(*parts, strict=True)
-        return cls(*(None if values[0] is None else torch.cat(values) for values in fields))
+        joined: list[Any] = [None if values[0] is None else torch.cat(values) for values in zip(*parts, strict=True)]
+        return cls(*joined)
 
     @property
     def seen(self) -> tuple[Tensor, ...]:
