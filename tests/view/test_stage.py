@@ -10,7 +10,7 @@ from torchdyn_plan.view.stage import body_meshes, camera_of, places_of, with_pla
 FLOOR = bare_floor(1.0)
 
 
-@pytest.mark.parametrize("name", WORLDS)
+@pytest.mark.parametrize("name", ["points", "trapper", "reach"])
 def test_every_world_has_a_look_and_a_posture(name):
     """What moves in the world moves in its model; a ball stands for what is not there."""
     if name.startswith("reach"):
