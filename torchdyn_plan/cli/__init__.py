@@ -107,7 +107,7 @@ def _unless_in_vain(arguments: Any) -> AbstractContextManager[None]:
     from torchdyn_plan.files import no_empty_folders
 
     out = arguments.out
-    return contextlib.nullcontext() if out is None else no_empty_folders(out.parent if out.suffix == ".json" else out)
+    return contextlib.nullcontext() if out is None else no_empty_folders(out.parent if out.suffix in FILES else out)
 
 
 def _check_benchmark(words: Sequence[str]) -> None:
