@@ -5,6 +5,8 @@ import torch
 
 from tests.envs.worlds import WORLDS
 from torchdyn_plan.envs.look import Look, bare_floor
+from torchdyn_plan.envs.painter import Painter
+from torchdyn_plan.tasks import load_task, task_names
 from torchdyn_plan.view.stage import body_meshes, camera_of, places_of, with_plain_colours
 
 FLOOR = bare_floor(1.0)
@@ -27,6 +29,22 @@ def test_every_world_has_a_look_and_a_posture(name):
     assert not np.array_equal(before, env.posture(0))
     before[:] = np.nan
     assert np.isfinite(env.posture(0)).all()
+
+
+@pytest.mark.parametrize("name", task_names())
+def test_every_task_can_be_drawn(name, monkeypatch):
+    """A task draws its pictures by the look that it tells."""
+    task = load_task(name)
+    if name.startswith("fetch"):
+        pytest.importorskip("gymnasium_robotics")
+    env = task.make_env(task.default_settings(), num_envs=1, seed=0, split="dev", num_threads=1)
+    env.reset()
+    drawn = []
+    monkeypatch.setattr(Painter, "picture", lambda self, posture, *_: drawn.append((self.model, posture)))
+    env._picture(0, 8, 8)
+    ((model, posture),) = drawn
+    assert model.nq == env.look().model.nq
+    np.testing.assert_array_equal(posture, env.posture(0))
 
 
 def test_every_body_that_can_be_seen_has_a_mesh_where_it_is():

@@ -15,6 +15,7 @@ from torchdyn_plan.envs.conveyor.scene import MOST_PARTS, ConveyorScene
 from torchdyn_plan.envs.conveyor.simulation import ConveyorSimulation
 from torchdyn_plan.envs.episodes import draw_uniform
 from torchdyn_plan.envs.moving_target import MovingTargetEnv, RobotReading
+from torchdyn_plan.envs.look import Look
 from torchdyn_plan.envs.painter import Painter
 from torchdyn_plan.envs.sensor import Sensor
 from torchdyn_plan.errors import InputError
@@ -220,7 +221,15 @@ class ConveyorEnv(MovingTargetEnv):
         way = self.speed * self.scene.control_step * torch.arange(1, steps + 1, dtype=now.dtype)
         return now.unsqueeze(1) + nn.functional.pad(way.unsqueeze(-1), (1, 1))
 
+    def look(self) -> Look:
+        """As of `MovingTargetEnv`: arm, belt and parts."""
+        return Look(self.simulation.model, lookat=(0.3, -0.05, 0.25), distance=1.9, azimuth=205.0)
+
+    def posture(self, row: int) -> np.ndarray[Any, Any]:
+        """As of `MovingTargetEnv`."""
+        return self.simulation.qpos[row].numpy().copy()
+
     def _picture(self, row: int, width: int, height: int) -> np.ndarray[Any, Any]:
         if self._painter is None:
-            self._painter = Painter(self.simulation.model, lookat=(0.3, -0.05, 0.25), distance=1.9, azimuth=205.0)
-        return self._painter.picture(self.simulation.qpos[row].numpy(), width, height)
+            self._painter = Painter(self.look())
+        return self._painter.picture(self.posture(row), width, height)
