@@ -49,7 +49,7 @@ def main(arguments: Arguments) -> None:
     axes.set(xlabel="standard deviation of a measurement [mm]", ylabel="solvable balls trapped", ylim=(0.0, 1.0))
     axes.set_title(f"balls of {arguments.velocity:g} m/s, 60 measurements a second, Kalman track", fontsize=10)
     axes.grid(alpha=0.3)
-    axes.legend(loc="lower left", fontsize=8)
+    axes.legend(loc="center right", fontsize=8)
     arguments.out.parent.mkdir(parents=True, exist_ok=True)
     figure.savefig(arguments.out, dpi=150)
     print(f"written: {arguments.out}")

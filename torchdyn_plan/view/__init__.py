@@ -10,6 +10,8 @@ import sys
 from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
+from torchdyn_plan.errors import InputError
+
 if TYPE_CHECKING:
     from torchdyn_plan.view.files import check_film, write_film
     from torchdyn_plan.view.page import Page, serve
@@ -54,7 +56,15 @@ def __dir__() -> list[str]:
 def draw_without_screen() -> None:
     """Let MuJoCo draw by EGL on a Linux machine without a screen, unless ``MUJOCO_GL`` says how it is to draw.
 
-    MuJoCo decides when it is first imported: afterwards this changes nothing.
+    MuJoCo decides when it is first imported: afterwards this changes nothing. Raises `InputError` if it cannot.
     """
     if sys.platform.startswith("linux") and not os.environ.get("DISPLAY"):
         os.environ.setdefault("MUJOCO_GL", "egl")
+    try:
+        import_module("mujoco")
+    except Exception as error:  # What fails, and how, depends on the machine's graphics library.
+        backend = os.environ.get("MUJOCO_GL", "")
+        raise InputError(
+            f"MuJoCo cannot draw here with MUJOCO_GL={backend!r} ({error}): install EGL or OSMesa, and set MUJOCO_GL to "
+            "egl or osmesa"
+        ) from error

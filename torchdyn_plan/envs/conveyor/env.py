@@ -14,8 +14,8 @@ from torchdyn_plan.envs.conveyor.panda import panda_arm
 from torchdyn_plan.envs.conveyor.scene import MOST_PARTS, ConveyorScene
 from torchdyn_plan.envs.conveyor.simulation import ConveyorSimulation
 from torchdyn_plan.envs.episodes import draw_uniform
-from torchdyn_plan.envs.moving_target import MovingTargetEnv, RobotReading
 from torchdyn_plan.envs.look import Look
+from torchdyn_plan.envs.moving_target import MovingTargetEnv, RobotReading
 from torchdyn_plan.envs.painter import Painter
 from torchdyn_plan.envs.sensor import Sensor
 from torchdyn_plan.errors import InputError
