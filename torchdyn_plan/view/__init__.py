@@ -65,6 +65,6 @@ def draw_without_screen() -> None:
     except Exception as error:  # What fails, and how, depends on the machine's graphics library.
         backend = os.environ.get("MUJOCO_GL", "")
         raise InputError(
-            f"MuJoCo cannot draw here with MUJOCO_GL={backend!r} ({error}): install EGL or OSMesa, and set MUJOCO_GL to "
-            "egl or osmesa"
+            f"MuJoCo cannot draw here with MUJOCO_GL={backend!r} ({error}): install EGL or OSMesa, and set MUJOCO_GL "
+            "to egl or osmesa"
         ) from error
