@@ -34,7 +34,7 @@ SMALL = {
     "reach_env": "--copies 2 --steps 4 --threads 1",
     "recovery": "--planners wait_and_drop --statics ik --velocities 5 --episodes 2 --num-envs 2 --split dev",
     "schedules": "--planners wait_and_drop --velocities 3 --schedules paper --episodes 4",
-    "sensors": "--sensors exact --velocities 5 --episodes 2 --num-envs 2 --planners untrained --tracks kalman held",
+    "sensors": "--sensors exact --velocities 5 --episodes 2 --num-envs 2 --planners untrained --tracks kalman",
     "static_task": "--episodes 8 --split dev",
     "worst_case": "--planners corner --statics ik --calls 40 --seconds 1",
     "track": "--batches 1 2 --seconds 0.01",

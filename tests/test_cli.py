@@ -373,6 +373,7 @@ def test_bench_replan_prints_and_writes_the_planners_that_are_named(tmp_path, ca
     assert content["config"]["batches"] == [1, 3]
 
 
+@pytest.mark.slow  # a process that starts from nothing and measures; `make torture` kills every other command
 def test_a_bench_that_is_killed_has_written_what_it_measured(tmp_path):
     out = tmp_path / "figures.json"
     words = f"bench replan --planner corner --batches 1 --seconds 2 --out {out}".split()

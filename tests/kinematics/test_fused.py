@@ -52,6 +52,7 @@ def test_a_copy_leaves_behind_what_was_compiled():
     assert pickle.loads(pickle.dumps(FUSED))._compiled == {}
 
 
+@pytest.mark.slow  # torch's compiler starts from nothing
 def test_without_a_compiler_the_error_says_so(tmp_path):
     code = (
         "import torch\nfrom torchdyn_plan.kinematics.fused import Fused\n"
