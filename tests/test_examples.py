@@ -1,5 +1,3 @@
-import subprocess
-import sys
 from pathlib import Path
 
 import pytest
@@ -83,15 +81,9 @@ def test_examples_are_short():
 def test_torchrls_own_arm_is_driven(tmp_path):
     pytest.importorskip("torchrl.envs", reason="TorchRL has the arm")
     folder = write_menagerie(tmp_path / "menagerie")
-    run = subprocess.run(
-        [sys.executable, EXAMPLES / "torchrl_arm.py", "--menagerie", folder],
-        capture_output=True,
-        text=True,
-        check=False,
-        timeout=300,
-    )
-    assert run.returncode == 0, run.stderr
-    off = {line.split()[0]: float(line.split()[4]) for line in run.stdout.splitlines() if "the pinch is" in line}
+    ran = run(EXAMPLES / "torchrl_arm.py", "--menagerie", folder, cwd=tmp_path)
+    assert ran.returncode == 0, ran.stderr
+    off = {line.split()[0]: float(line.split()[4]) for line in ran.stdout.splitlines() if "the pinch is" in line}
     assert set(off) == {"above", "down", "up"}
-    assert max(off.values()) < 5.0, run.stdout
-    assert "1000 of 1000 poses solved at once" in run.stdout
+    assert max(off.values()) < 5.0, ran.stdout
+    assert "1000 of 1000 poses solved at once" in ran.stdout

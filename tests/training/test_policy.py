@@ -54,7 +54,7 @@ def weights(folder: Path) -> dict[str, torch.Tensor]:
     return Actor.from_pretrained(folder / "policy").state_dict()
 
 
-@pytest.mark.parametrize("kind", [DDPGRecipe, AveragedRecipe])
+@pytest.mark.parametrize("kind", [DDPGRecipe, pytest.param(AveragedRecipe, marks=pytest.mark.slow)])
 def test_learns_to_reach(kind: type[DDPGRecipe], tmp_path: Path) -> None:
     recipe = kind(iterations=30, num_envs=16, updates=30, batch=128, capacity=20_000, warmup=2, gamma=0.9)
     fit_policy(PointTask(), tmp_path, recipe=recipe, score_every=10)
