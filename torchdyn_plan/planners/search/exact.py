@@ -68,7 +68,11 @@ class ExactSearch:
     reads_turn: ClassVar[bool] = True
 
     stride: int = 5
-    """Control steps between candidates; an arrival bin's width loses nothing."""
+    """Control steps between candidates; an arrival bin's width loses nothing.
+
+    Successive plans have the same candidates only where the schedule's period is a multiple of it. With a
+    ``switching_cost``, plan at such a period or take stride 1: else the meeting moves a little with each plan.
+    """
     first: int = 2
     """Step of the first candidate; the middle of the first arrival bin."""
     height: float | None = None
