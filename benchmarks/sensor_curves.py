@@ -1,6 +1,6 @@
 """Draw what noise costs each planner: success over the noise of a sensor of 60 Hz.
 
-python benchmarks/sensor_curves.py benchmarks/results/sensors.json --out docs/sensors.png
+python benchmarks/sensor_curves.py benchmarks/results/sensor_curves.json --out docs/sensors.png
 """
 
 import json
