@@ -54,7 +54,8 @@ def for_inference(planner: Any) -> Any:
 def plan_call(planner: Any, seen: TensorDict) -> tuple[Callable[..., Sequence[Tensor]], tuple[Any, ...]]:
     """What makes a plan, and its arguments: what the planner itself does for rows that plan."""
     if not hasattr(planner, "replan"):
-        entries = seen["robot_state"], seen["target_pos"], seen["tool_pos"], torch.zeros_like(seen["step_count"])
+        planned_steps = torch.zeros(seen.batch_size, dtype=torch.int64)
+        entries = seen["robot_state"], seen["target_pos"], seen["tool_pos"], planned_steps
         return planner.plan_ahead, (*entries, seen["target_history"])
     from torchdyn_plan.bench.observations import observe
     from torchdyn_plan.planners import Plan

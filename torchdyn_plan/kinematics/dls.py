@@ -58,7 +58,7 @@ def square_turn(x: Tensor, y: Tensor) -> Tensor:
 def limited_step(step: Tensor, limit: Tensor, gain: float) -> Tensor:
     """Shorten ``step`` (*B, N) to ``gain`` of itself, and further so that no joint moves more than ``limit`` (N,)."""
     worst = (step.abs() / limit).amax(dim=-1, keepdim=True)
-    return step * torch.clamp(1.0 / worst.clamp_min(1e-12), max=gain)
+    return step * torch.clamp(worst.clamp_min(1e-12).reciprocal(), max=gain)
 
 
 def braked_step(step: Tensor, limit: Tensor, brake: Tensor) -> Tensor:

@@ -37,13 +37,14 @@ class Fused:
             CompileError: there is no compiler, or it failed.
             InputError: an argument requires a gradient.
         """
-        if any(argument.requires_grad for argument in arguments) and torch.is_grad_enabled():
+        if torch.is_grad_enabled() and any(argument.requires_grad for argument in arguments):
             raise InputError("a compiled solve has no derivatives: detach its arguments, or leave compiled=False")
-        columns = [argument.T.contiguous() for argument in arguments]
+        columns = [in_columns(argument) for argument in arguments]
         key = columns[0].device, columns[0].dtype
-        if key not in self._compiled:
-            self._compiled[key] = self._compile([argument.shape[1] for argument in arguments], *key)
-        return [result.T for result in self._compiled[key](*columns)]
+        compiled = self._compiled.get(key)
+        if compiled is None:
+            compiled = self._compiled[key] = self._compile([argument.shape[1] for argument in arguments], *key)
+        return [result.T for result in compiled(*columns)]
 
     def __getstate__(self) -> dict[str, Any]:
         """Without what was compiled, which belongs to this process."""
@@ -78,6 +79,13 @@ class Fused:
                 f"that CXX names). Leave compiled=False to do without. {reason[0] if reason else error!r}"
             ) from error
         return compiled
+
+
+def in_columns(rows: Tensor) -> Tensor:
+    """``rows`` (B, W) as columns ``(W, B)``, one after another in memory."""
+    columns = rows.T
+    # To stack columns takes half as long as `contiguous` does.
+    return columns if columns.is_contiguous() else torch.stack(rows.unbind(1))
 
 
 def filled(value: Component, like: Tensor) -> Tensor:

@@ -136,8 +136,16 @@ def remember(tensordict: TensorDictBase, entries: Mapping[str, Tensor]) -> None:
     The memory is a new one at each step: tensordicts of earlier steps may share the old one.
     """
     stored = tensordict.get(keys.PLAN, None)
-    whole = dict(entries) if stored is None else dict(stored.items()) | dict(entries)
-    tensordict.set(keys.PLAN, TensorDict(whole, tensordict.batch_size, device=tensordict.device))
+    # A plain dictionary: to look at a tensordict takes as long as a small operation.
+    whole = {} if stored is None else dict(stored.items())
+    if 2 * len(entries) < len(whole):
+        # Each entry of a new tensordict is checked, which takes longer than to leave some out of one that is there.
+        fresh = stored.exclude(*entries)
+        for name, value in entries.items():
+            fresh.set(name, value)
+    else:
+        fresh = TensorDict(whole | dict(entries), tensordict.batch_size, device=tensordict.device)
+    tensordict.set(keys.PLAN, fresh)
 
 
 class Remembering(TensorDictModuleBase):

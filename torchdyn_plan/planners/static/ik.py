@@ -52,6 +52,7 @@ TURN_TOLERANCE = 0.05
 GOAL_SPEED = 2.0
 """A goal that is another one than a step before, nearer than this speed explains, moves; else it is a new one [m/s]."""
 PATH_NAMES = tuple(f"path_{field}" for field in Path._fields)
+PATH_SET = frozenset(PATH_NAMES)
 
 
 class IKPlanner(Precise, StaticPlannerModule):
@@ -113,6 +114,7 @@ class IKPlanner(Precise, StaticPlannerModule):
         self.control_step, self.damping, self.gain, self.chunk = control_step, damping, gain, chunk
         self.compiled = compiled
         self._fused = Fused(self._fused_step) if compiled else None
+        self._width = torch.Size([arm.num_joints])
         self.register_buffer("_limit", arm.needed_speed_limit("IKPlanner") * control_step, False)
         self.acceleration = acceleration
         self.register_buffer("_brake", None if acceleration is None else self._brake_of(acceleration), False)
@@ -123,21 +125,23 @@ class IKPlanner(Precise, StaticPlannerModule):
         Raises:
             InputError: a key is missing, a shape is wrong, or the goal holds a NaN or an infinity.
         """
-        wanted = keys.JOINT_POS, self.goal_key, keys.STEP_COUNT
-        values: list[Any] = [tensordict.get(key, None) for key in wanted]
-        if any(value is None for value in values):
-            values = [read(tensordict, key, "IKPlanner") for key in wanted]
-        joint_pos, goal, step_count = values
+        joint_pos, goal = tensordict.get(keys.JOINT_POS, None), tensordict.get(self.goal_key, None)
+        step_count = tensordict.get(keys.STEP_COUNT, None)
+        if joint_pos is None or goal is None or step_count is None:
+            wanted = keys.JOINT_POS, self.goal_key, keys.STEP_COUNT
+            joint_pos, goal, step_count = (read(tensordict, key, "IKPlanner") for key in wanted)
         if not torch.compiler.is_compiling():
-            fits = joint_pos.shape[-1:] == self._limit.shape and goal.shape == (*joint_pos.shape[:-1], self.goal_size)
+            fits = joint_pos.shape[-1:] == self._width and goal.shape == (*joint_pos.shape[:-1], self.goal_size)
             if not (fits and math.isfinite(debug_unwrap(goal).sum().item())):
                 self._check(joint_pos, goal)
         path_pos, path_step, before = self._recall(tensordict.get(keys.PLAN, None), joint_pos, goal, step_count)
         goals = (goal,) if self.acceleration is None else (goal, before)
         blocks = self.chunk is not None and self._fused is None
         action, path_pos = self._step_blocks(path_pos, *goals) if blocks else self.step(path_pos, *goals)
-        tensordict.set(keys.ACTION, action.to(joint_pos.dtype))
-        path = Path(path_pos.to(joint_pos.dtype), path_step + 1, goal)
+        if action.dtype != joint_pos.dtype:
+            action, path_pos = action.to(joint_pos.dtype), path_pos.to(joint_pos.dtype)
+        tensordict.set(keys.ACTION, action)
+        path = Path(path_pos, path_step + 1, goal)
         remember(tensordict, dict(zip(PATH_NAMES, path, strict=True)))
         return tensordict
 
@@ -184,7 +188,7 @@ class IKPlanner(Precise, StaticPlannerModule):
         Where ``plan`` holds none to follow, a new path begins.
         """
         stored: dict[str, Any] = {} if plan is None else dict(plan.items())
-        if any(name not in stored for name in PATH_NAMES):
+        if not stored.keys() >= PATH_SET:
             warn_of_loss(PATH_NAMES[0], step_count == 0)
             return joint_pos, torch.zeros(joint_pos.shape[:-1], dtype=torch.int64, device=joint_pos.device), goal
         path = Path(*(stored[name] for name in PATH_NAMES))
@@ -254,7 +258,10 @@ class IKPlanner(Precise, StaticPlannerModule):
         Returns:
             The action ``(*B, N)`` and the joint angles to which the path has come ``(*B, N)`` [rad].
         """
-        joint_pos, goal = joint_pos.to(self._limit.dtype), goal.to(self._limit.dtype)
+        # A module's attribute that is a buffer takes as long to look up as a small operation; its table does not.
+        dtype = cast(Tensor, self._buffers["_limit"]).dtype
+        if joint_pos.dtype != dtype or goal.dtype != dtype:
+            joint_pos, goal = joint_pos.to(dtype), goal.to(dtype)
         if self._fused is not None:
             if joint_pos.ndim == 2:
                 return self._step_fused(joint_pos, goal)
@@ -293,7 +300,6 @@ class IKPlanner(Precise, StaticPlannerModule):
         """`step` where the tool's pose and Jacobian are known."""
         error = torch.stack(self.approach.twist(pose.flatten(-2).unbind(-1), goal.unbind(-1)), dim=-1)
         rows = jacobian if error.shape[-1] == 6 else jacobian[..., : error.shape[-1], :]
-        # A module's attribute that is a buffer takes as long to look up as a small operation; its table does not.
         limit, bounds = cast(Tensor, self._buffers["_limit"]), cast(dict[str, Tensor], self.arm._buffers)
         low, high = bounds["lower"] - joint_pos, bounds["upper"] - joint_pos
         whole = dls_step(rows, error, self.damping)
@@ -319,16 +325,19 @@ class IKPlanner(Precise, StaticPlannerModule):
     def _step_fused(self, joint_pos: Tensor, goal: Tensor) -> tuple[Tensor, Tensor]:
         """`step` of rows in one compiled loop; rows that push a joint beyond its limits are solved again."""
         assert self._fused is not None
-        action, reached, pushed = self._fused(joint_pos, goal)
-        # A row alone is read as it is: a sum would take a tenth of the step.
-        if (pushed if pushed.numel() == 1 else pushed.sum()).item():
-            rows = pushed.squeeze(-1).nonzero().squeeze(-1)
+        action, reached, room = self._fused(joint_pos, goal)
+        # A row alone is read as it is: to look for the least would take a tenth of the step.
+        if not (room if room.numel() == 1 else room.amin()).item() > 0.0:
+            rows = (room.squeeze(-1) <= 0.0).nonzero().squeeze(-1)
             joint_pos, goal = joint_pos[rows], goal[rows]
             action[rows], reached[rows] = self._step_from(joint_pos, goal, *evaluate(self.arm, joint_pos))
         return action, reached
 
     def _fused_step(self, joint_pos: Columns, goal: Columns) -> tuple[Vector, Vector, Vector]:
-        """`step`, column by column, all joints taking part; and 1 in rows where one at its limit should not have."""
+        """`step`, column by column, all joints taking part; and how far the nearest limit ahead of any of them is [rad].
+
+        Where that is none, a joint at its limit should not have taken part.
+        """
         rotation, place, jacobian = self.arm.components(joint_pos)
         pose = [entry for row, end in zip(rotation, place, strict=True) for entry in (*row, end)]
         error = self.approach.twist([filled(entry, joint_pos[0]) for entry in pose], goal)
@@ -340,11 +349,10 @@ class IKPlanner(Precise, StaticPlannerModule):
         bounds = zip(joint_pos, lower, upper, strict=True)
         ways = [(low - here, high - here) for here, low, high in bounds]
         pairs = zip(step, ways, strict=True)
-        out = [((low >= 0.0) & (value < 0.0)) | ((high <= 0.0) & (value > 0.0)) for value, (low, high) in pairs]
-        pushed = functools.reduce(torch.logical_or, out).to(goal[0].dtype)
+        room = functools.reduce(torch.minimum, [torch.where(value < 0.0, -low, high) for value, (low, high) in pairs])
         step = [torch.clamp(value * share, *way) for value, way in zip(step, ways, strict=True)]
         action = [(value / most).clamp(-1.0, 1.0) for value, most in zip(step, limit, strict=True)]
-        return action, [here + value for here, value in zip(joint_pos, step, strict=True)], [pushed]
+        return action, [here + value for here, value in zip(joint_pos, step, strict=True)], [room]
 
     def _pose_and_jacobian(self, joint_pos: Tensor) -> tuple[Tensor, Tensor]:
         """The arm's, from products of always ``chunk`` rows where ``joint_pos`` is a multiple of them."""
