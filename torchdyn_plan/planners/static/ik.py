@@ -334,7 +334,7 @@ class IKPlanner(Precise, StaticPlannerModule):
         return action, reached
 
     def _fused_step(self, joint_pos: Columns, goal: Columns) -> tuple[Vector, Vector, Vector]:
-        """`step`, column by column, all joints taking part; and how far the nearest limit ahead of any of them is [rad].
+        """`step`, column by column, all joints taking part; and the least way that one has to the limit ahead [rad].
 
         Where that is none, a joint at its limit should not have taken part.
         """
