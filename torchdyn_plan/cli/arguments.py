@@ -167,6 +167,9 @@ class SweepArguments(EpisodeArguments):
     """Values of the setting; the paper's when none are given, or the task's."""
     repeats: int = 10
     """Series of episodes for each value, with consecutive seeds."""
+    engine: str = "here"
+    workers: int | None = None
+    """Ray workers, of one thread each; as many as the cluster has processors when not given."""
 
 
 @dataclass(frozen=True, kw_only=True)

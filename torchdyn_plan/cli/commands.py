@@ -89,6 +89,8 @@ def sweep(task: Task, arguments: SweepArguments) -> None:
         out=arguments.out,
         values=arguments.values,
         repeats=arguments.repeats,
+        engine=arguments.engine,
+        workers=arguments.workers,
         **_shared(task, arguments),
     )
     say(format_table(task, rows))

@@ -43,6 +43,8 @@ FITTED = {
 
 TRACKS = ("none", "least_squares", "kalman")
 """Tracks by name; tests hold them against `torchdyn_plan.evaluation.tracks`, which takes long to import."""
+ENGINES = ("here", "ray")
+"""What runs a sweep; tests hold them against `torchdyn_plan.evaluation.engines`, which takes long to import."""
 LAYERS = ("region", "trail", "forecast", "candidates", "goal", "measurements", "track", "tool", "target")
 """What is drawn beside a world; tests hold them against `torchdyn_plan.view.marks`, which takes long to import."""
 SHOWN = "Planners that are shown side by side."
@@ -87,7 +89,7 @@ def command_forms(task: Task, named: str) -> dict[str, type[Any]]:
     """The arguments of each command but ``train`` and ``bench`` for ``task``, which the words call ``named``."""
     return {
         "evaluate": _episode_form(EvaluateArguments, task, named),
-        "sweep": _episode_form(SweepArguments, task, named, over=_over(task)),
+        "sweep": _episode_form(SweepArguments, task, named, over=_over(task), engine=_engine()),
         "report": ReportArguments,
         "collect": _form(
             CollectArguments,
@@ -182,6 +184,11 @@ def _layers() -> tuple[Any, Any]:
 def _over(task: Task) -> Any:
     names = [one.name for one in dataclasses.fields(task.settings) if one.metadata.get("sweep")]
     return _option(str, "What varies.", choices=names)
+
+
+def _engine() -> Any:
+    text = "Where points are run: here, or by the workers of a Ray cluster, with the same results."
+    return _option(str, text, choices=ENGINES, default=ENGINES[0])
 
 
 def _static_option(task: Task, text: str) -> Any:

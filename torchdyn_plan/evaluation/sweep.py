@@ -11,6 +11,7 @@ from typing import Any, TypedDict
 from torchdyn_plan.checks import check_choice, check_count, check_seed
 from torchdyn_plan.envs.sensor import Sensor
 from torchdyn_plan.errors import InputError
+from torchdyn_plan.evaluation.engines import Engine, Job, find_engine
 from torchdyn_plan.evaluation.identity import (
     POINTS,
     SWEEP,
@@ -61,6 +62,8 @@ def sweep(
     other_scene: bool = False,
     overwrite: bool = False,
     progress: bool = True,
+    engine: str = "here",
+    workers: int | None = None,
     **settings: Any,
 ) -> list[ResultRow]:
     """Evaluate planners along the values of a setting, and write ``results.json`` and ``sweep.png``.
@@ -87,6 +90,9 @@ def sweep(
         other_scene: allow planners that belong to another scene.
         overwrite: remove all results in the folder, including points of this sweep.
         progress: show progress bars.
+        engine: ``here``, or ``ray`` to have workers of a Ray cluster run the points: the same results, but for the
+            time that they took.
+        workers: number of Ray workers, of one thread each; one for each processor for None.
         settings: of the task, by name, but for the one that varies.
 
     Returns:
@@ -100,6 +106,7 @@ def sweep(
     """
     task = load_task(task)
     check_choice(f"setting of {task.name} to sweep over", over, sweepable(task))
+    run = find_engine(engine, workers)
     check_count("repeats", repeats, maximum=100_000)
     check_seed(seed)
     base = task.default_settings(**settings)
@@ -122,7 +129,7 @@ def sweep(
     if len(set(chosen)) < len(chosen):
         raise InputError(f"values must differ, got {' '.join(map(str, chosen))}")
     points = {value: dataclasses.replace(base, **{over: value}) for value in chosen}
-    return _Sweep(study, over, points, repeats, seed, check_writable_folder(Path(out))).run(overwrite)
+    return _Sweep(study, over, points, repeats, seed, check_writable_folder(Path(out)), run).run(overwrite)
 
 
 def sweepable(task: Task) -> list[str]:
@@ -153,6 +160,7 @@ class _Sweep:
     repeats: int
     seed: int
     out: Path
+    engine: Engine
 
     def run(self, overwrite: bool) -> list[ResultRow]:
         """Run the points that the folder lacks, and put together all that were asked for."""
@@ -182,9 +190,10 @@ class _Sweep:
 
     def _run_missing_points(self) -> None:
         missing = [point for point in self._all_points() if not exists(self._path(*point))]
-        quiet = not (missing and self.study.progress)
-        for value, repeat in progress_bar(missing, desc=f"sweep over {self.over}", unit="point", disable=quiet):
-            outcomes = self.study.run(self.points[value], self.seed + repeat)
+        jobs = {(value, repeat): Job(self.points[value], self.seed + repeat) for value, repeat in missing}
+        done, quiet = self.engine(self.study, jobs), not (missing and self.study.progress)
+        bar = progress_bar(done, desc=f"sweep over {self.over}", unit="point", disable=quiet, total=len(missing))
+        for (value, repeat), outcomes in bar:
             planners = {name: episodes.to_json(self.study.task) for name, episodes in outcomes.items()}
             point = Point(identity=self._digest(value, repeat), content=digest_of(planners), planners=planners)
             write_json(self._path(value, repeat), point)
