@@ -10,9 +10,9 @@ from torch import Tensor
 from torchdyn_plan.checks import check_number, check_same_device, check_trailing_shape
 from torchdyn_plan.errors import InputError
 from torchdyn_plan.kinematics.arm import Arm
-from torchdyn_plan.kinematics.follow import follow_rows, following
 from torchdyn_plan.kinematics.solver import ROUNDS, IKResult, check_task, inside_limits, solve_rows
 from torchdyn_plan.kinematics.targets import is_pose, rotation_matrix, rotation_vector
+from torchdyn_plan.kinematics.trajectory import follow_rows, following
 from torchdyn_plan.precision import Precise, without_autocast
 
 SOLUTIONS = 4

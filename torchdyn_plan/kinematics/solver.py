@@ -14,11 +14,11 @@ from torch import Tensor
 from torchdyn_plan.checks import check_choice, check_number
 from torchdyn_plan.errors import InputError
 from torchdyn_plan.kinematics.arm import Arm
-from torchdyn_plan.kinematics.branches import NUMBER, Universal, all_branches, tool_turns, universal
 from torchdyn_plan.kinematics.descent import Search, descend, evaluate, residual_at, rows_at
 from torchdyn_plan.kinematics.implicit import refine
 from torchdyn_plan.kinematics.nearest import TURN, first_distinct, reduced, revolute, speeds, travel, turned_towards
 from torchdyn_plan.kinematics.targets import CONSTRAINTS, as_pose, as_rows, is_pose
+from torchdyn_plan.kinematics.ur_branches import NUMBER, Universal, all_branches, tool_turns, universal
 from torchdyn_plan.precision import without_autocast
 
 ROUNDS = (1, 4, 16, 64, 128)
