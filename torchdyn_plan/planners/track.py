@@ -67,7 +67,7 @@ class TrackState(NamedTuple):
         return torch.stack([own[..., :2], torch.stack([own[..., 1], own[..., n]], dim=-1)], dim=-2)
 
     def path(self, time: Tensor) -> Tensor:
-        """Positions ``(*B, T, D)`` at times ``time`` (*B, T) [s] [m, world].
+        """Positions ``(*B, T, D)`` [m, world] at times ``time`` (*B, T) [s].
 
         Times before the last bounce use the motion before it. Before the first measurement the target is taken to rest
         at its first position.
