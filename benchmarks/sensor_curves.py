@@ -1,4 +1,4 @@
-"""Draw what noise costs each planner: success over the noise of a sensor of 60 Hz.
+"""Draw success over the noise of a 60 Hz sensor, for each planner.
 
 python benchmarks/sensor_curves.py benchmarks/results/sensor_curves.json --out docs/sensors.png
 """

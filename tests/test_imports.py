@@ -1,4 +1,6 @@
 import ast
+import importlib
+import pkgutil
 import subprocess
 import sys
 from collections.abc import Iterator
@@ -10,7 +12,7 @@ import pytest
 import torchdyn_plan
 
 ROOT = Path(torchdyn_plan.__file__).parent
-WORDS = {"errors", "checks", "files", "keys", "precision", "progress", "schemas", "stopping", "threads"}
+WORDS = {"errors", "checks", "files", "keys", "lazy", "precision", "progress", "schemas", "stopping", "threads"}
 """What everything may use."""
 MODELS = WORDS | {"versions", "kinematics", "nets", "planners"}
 STUDIES = MODELS | {"envs", "tasks"}
@@ -164,9 +166,43 @@ def test_importing_stays_light(statement, absent):
     assert done.stdout.split() == []
 
 
+LAZY = ["planners", "kinematics", "nets", "envs", "training", "view"]
+"""Packages that import their public names on first use."""
+
+
+def test_importing_a_package_loads_no_library():
+    code = f"import sys, {', '.join(f'torchdyn_plan.{part}' for part in LAZY)}; print(*sys.modules)"
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    loaded = set(done.stdout.split())
+    assert not {name.split(".")[0] for name in loaded} & HEAVY
+    own = {"torchdyn_plan", "torchdyn_plan.lazy", "torchdyn_plan.errors", *(f"torchdyn_plan.{part}" for part in LAZY)}
+    assert {name for name in loaded if name.startswith("torchdyn_plan")} == own
+
+
+@pytest.mark.parametrize("part", ["", *LAZY])
+def test_lazy_names_are_those_that_type_checkers_see(part):
+    """The three lists of a package (homes, imports for type checkers, ``__all__``) agree, and each name is there."""
+    package = importlib.import_module("torchdyn_plan" + (part and f".{part}"))
+    tree = ast.parse(Path(package.__file__).read_text())
+    skipped = [node for node in tree.body if isinstance(node, ast.If)]
+    seen = {name.rpartition(".")[2]: name.rpartition(".")[0] for node in skipped for name in imports(node)}
+    defined = {node.name for node in tree.body if isinstance(node, ast.FunctionDef)} | {"__version__"}
+    assert set(package.__all__) - defined == set(seen)
+    homes = ast.literal_eval(next(node.args[1] for node in ast.walk(tree) if isinstance(node, ast.Call)))
+    listed = {name: f"{package.__name__}.{module}" for module, names in homes.items() for name in names}
+    assert listed == seen
+    assert set(package.__all__) <= set(dir(package))
+    submodules = {one.name for one in pkgutil.iter_modules(package.__path__)}
+    assert not set(seen) & submodules, "importing the submodule would hide the name"
+    with pytest.raises(AttributeError, match="no attribute 'nonsense'"):
+        package.nonsense  # noqa: B018
+    for name, module in seen.items():
+        assert getattr(package, name) is getattr(importlib.import_module(module), name)
+
+
 MAY_LOAD = {
     # tensordict itself takes seconds, as it imports torch._dynamo; what is above it is ours.
-    "import torch, tensordict.nn": ("import torchdyn_plan.planners", {"torchdyn_plan"}),
+    "import torch, tensordict.nn": ("from torchdyn_plan.planners import DynamicPlanner", {"torchdyn_plan"}),
     "": (
         "import contextlib; from torchdyn_plan.cli import main\nwith contextlib.suppress(SystemExit): main(['--help'])",
         {"torchdyn_plan", "tyro", "docstring_parser", "typing_extensions", "typeguard"},

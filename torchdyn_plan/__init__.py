@@ -1,9 +1,8 @@
-"""Planners for static targets, made to meet moving ones.
+"""Planners for static targets, made to meet moving ones."""
 
-Everything named here is imported when it is first used, so that importing the package costs nothing.
-"""
+from torchdyn_plan.lazy import lazy_names
 
-# Importing typing for this name would cost more than all the rest; type checkers know it by its name.
+# Importing typing for this constant would cost more than all the rest; type checkers know it by its name.
 TYPE_CHECKING = False
 
 if TYPE_CHECKING:
@@ -33,33 +32,14 @@ __all__ = [
     "train",
 ]
 
-_HOMES = {
-    "DynamicPlanner": "torchdyn_plan.planners",
-    "IKPlanner": "torchdyn_plan.planners",
-    "Settings": "torchdyn_plan.tasks",
-    "Task": "torchdyn_plan.tasks",
-    "Words": "torchdyn_plan.tasks",
-    "collect": "torchdyn_plan.training.collect",
-    "evaluate": "torchdyn_plan.evaluation",
-    "load_task": "torchdyn_plan.tasks",
-    "register": "torchdyn_plan.tasks",
-    "setting": "torchdyn_plan.tasks",
-    "sweep": "torchdyn_plan.evaluation.sweep",
-    "task_names": "torchdyn_plan.tasks",
-    "train": "torchdyn_plan.training.train",
-}
-"""Module of each name."""
-
-
-def __getattr__(name: str) -> object:
-    import importlib
-
-    if name not in _HOMES:
-        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
-    value = getattr(importlib.import_module(_HOMES[name]), name)
-    globals()[name] = value
-    return value
-
-
-def __dir__() -> list[str]:
-    return sorted({*globals(), *__all__})
+__getattr__, __dir__ = lazy_names(
+    __name__,
+    {
+        "evaluation": ("evaluate",),
+        "evaluation.sweep": ("sweep",),
+        "planners": ("DynamicPlanner", "IKPlanner"),
+        "tasks": ("Settings", "Task", "Words", "load_task", "register", "setting", "task_names"),
+        "training.collect": ("collect",),
+        "training.train": ("train",),
+    },
+)

@@ -193,7 +193,7 @@ def coupled():
 )
 def test_other_arms_are_refused_with_the_reason_and_solved_otherwise(arm, reason):
     target = arm(configurations(5, arm.num_joints, seed=9, spread=1.0))
-    with pytest.raises(InputError, match=f"branches handles arms of the UR family alone: .*{reason}"):
+    with pytest.raises(InputError, match=f"branches handles arms of the UR family only: .*{reason}"):
         branches(arm, target)
     assert (solve_ik(arm, target, solutions=2).status[:, 0] == IKStatus.SOLVED).all()
 

@@ -50,14 +50,14 @@ PLACES = torch.tensor([[[1.0, 0.0], [0.0, 3.0], [-4.0, 0.0]]]).repeat(2, 1, 1)
 VELOCITY = torch.tensor([[[2.0, 0.0], [0.0, -0.5], [0.0, 0.0]]]).repeat(2, 1, 1)
 
 
-@pytest.mark.filterwarnings("ignore:a planner remembers nothing")
+@pytest.mark.filterwarnings("ignore:the planner's memory is missing")
 def test_the_target_that_is_met_soonest_is_chosen_not_the_nearest():
     found = act(planner_of(), observation(PLACES, VELOCITY))
     assert found["plan", "choice_target"].tolist() == [1, 1]
     assert "target_pos" not in found.keys()  # noqa: SIM118
 
 
-@pytest.mark.filterwarnings("ignore:a planner remembers nothing")
+@pytest.mark.filterwarnings("ignore:the planner's memory is missing")
 def test_empty_slots_do_not_count_and_a_row_without_any_holds_still():
     present = torch.tensor([[True, False, True], [False, False, False]])
     places = PLACES.clone()
@@ -68,7 +68,7 @@ def test_empty_slots_do_not_count_and_a_row_without_any_holds_still():
     assert torch.equal(found["action"][1], torch.zeros(2))
 
 
-@pytest.mark.filterwarnings("ignore:a planner remembers nothing")
+@pytest.mark.filterwarnings("ignore:the planner's memory is missing")
 def test_a_value_goes_before_the_time_but_not_for_a_target_out_of_reach():
     value = torch.tensor([[9.0, 1.0, 2.0], [9.0, 2.0, 2.0]])
     found = act(planner_of(), observation(PLACES, VELOCITY, targets_value=value))

@@ -32,7 +32,7 @@ def seen():
     return td
 
 
-@pytest.mark.filterwarnings("ignore:a planner remembers nothing")
+@pytest.mark.filterwarnings("ignore:the planner's memory is missing")
 @pytest.mark.parametrize("change", CHANGES.values(), ids=CHANGES.keys())
 @pytest.mark.parametrize("key", KEYS)
 def test_a_wrong_entry_is_named(planner, seen, key, change):
@@ -101,7 +101,7 @@ def test_a_memory_that_was_changed_is_named(seen, name, change, says):
         planner(seen)
 
 
-@pytest.mark.filterwarnings("ignore:a planner remembers nothing")
+@pytest.mark.filterwarnings("ignore:the planner's memory is missing")
 @pytest.mark.parametrize(
     ("change", "says"),
     [

@@ -190,9 +190,9 @@ def test_nonsense_is_named(change, message):
 
 def test_an_axis_of_another_space_is_named():
     flat = MatchVelocity(hover=0.1, descent_steps=5, axis=(0.0, 1.0))
-    with pytest.raises(InputError, match="axis has 2 numbers, but places have 3 coordinates"):
+    with pytest.raises(InputError, match="axis has 2 numbers, but positions have 3 coordinates"):
         flat.search()
-    with pytest.raises(InputError, match="axis has 2 numbers, but places have 3 coordinates"):
+    with pytest.raises(InputError, match="axis has 2 numbers, but positions have 3 coordinates"):
         run(make_planner(MANEUVER).with_parts(maneuver=flat), BELT, SPEEDS, steps=3)
 
 

@@ -119,7 +119,7 @@ def test_an_entry_that_is_absent_in_mid_episode_is_told_and_never_at_the_start()
         planner(observation((3,), step=7))
     late = observation((3,), step=0)
     late["step_count"] = torch.tensor([0, 0, 5])
-    with pytest.warns(RuntimeWarning, match="remembers nothing"):
+    with pytest.warns(RuntimeWarning, match="the planner's memory is missing"):
         planner(late)
     # What another part has forgotten is told, too, and the plan is kept.
     planner(late)
@@ -136,7 +136,7 @@ def test_a_static_planner_that_forgets_says_so(static):
         warnings.simplefilter("error", RuntimeWarning)
         pursuit(td)
     td["step_count"] += 1
-    with pytest.warns(RuntimeWarning, match="remembers nothing"):
+    with pytest.warns(RuntimeWarning, match="the planner's memory is missing"):
         pursuit(td.exclude("plan"))
 
 

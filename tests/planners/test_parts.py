@@ -146,7 +146,7 @@ def test_two_parts_that_remember_one_name_are_refused():
 
 
 def test_a_static_planner_that_remembers_the_planners_own_names_is_refused():
-    with pytest.raises(InputError, match=r"the static planner and the planner both remember .*window"):
+    with pytest.raises(InputError, match=r"the static planner and the planner both store .*window"):
         make_planner().with_parts(static=make_planner())
 
 

@@ -169,8 +169,8 @@ def test_a_memory_of_a_plane_is_carried_by_a_primer():
     ("change", "message"),
     [
         ({"tool_pos": 4}, r"tool_pos must have shape \(\*B, 2\) or \(\*B, 3\), got \(4, 4\)"),
-        ({"tool_pos": 3}, "tool_pos and target_pos must be of as many coordinates, got 3 and 2"),
-        ({"target_pos": 3}, "tool_pos and target_pos must be of as many coordinates, got 2 and 3"),
+        ({"tool_pos": 3}, "tool_pos and target_pos must have equally many coordinates, got 3 and 2"),
+        ({"target_pos": 3}, "tool_pos and target_pos must have equally many coordinates, got 2 and 3"),
         ({"target_history": 3}, "target_history must have shape"),
     ],
 )

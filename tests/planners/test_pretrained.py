@@ -395,8 +395,8 @@ DAMAGE = [
     (search_of("torchdyn_plan.planners.search.exact:ExactSearch", strid=2), "search of .*strid"),
     (search_of("torchdyn_plan.planners.search.exact:Exact"), "search of .*Exact"),
     (search_of("torchdyn_plan.planners.search.nowhere:ExactSearch"), "search of .*nowhere"),
-    (search_of("torchdyn_plan.files:write_json"), "search of .*is no part of a planner"),
-    (search_of("torchdyn_plan.errors:InputError"), "search of .*is no part of a planner"),
+    (search_of("torchdyn_plan.files:write_json"), "search of .*is not a part of a planner"),
+    (search_of("torchdyn_plan.errors:InputError"), "search of .*is not a part of a planner"),
     (search_of(3), "search of "),
     (put("search", {"wrong": 1}), "search of .*cannot be made"),
     (network_of("torchdyn_plan.nets.forecaster:Forecaster"), "eta of .*ETANetwork"),
@@ -433,7 +433,7 @@ def test_foreign_code_is_not_imported(saved, path):
 @pytest.mark.parametrize("path", ["os:system", "subprocess:Popen", "builtins:eval", "torch:load", "os:path"])
 def test_what_is_imported_and_no_part_is_not_called(saved, path):
     change(saved, search_of(path, args="false"))
-    with pytest.raises(WeightsError, match=rf"{path} is no part of a planner"):
+    with pytest.raises(WeightsError, match=rf"{path} is not a part of a planner"):
         DynamicPlanner.from_pretrained(saved)
 
 
@@ -448,7 +448,7 @@ def test_a_part_of_a_module_that_is_no_longer_imported(saved, tmp_path):
 
 
 def test_a_folder_without_a_planner_and_one_that_cannot_be_written(tmp_path):
-    with pytest.raises(InputError, match=rf"holds no planner: no {FILE}"):
+    with pytest.raises(InputError, match=rf"holds no planner: it lacks {FILE}"):
         DynamicPlanner.from_pretrained(tmp_path)
     (tmp_path / "file").write_text("")
     with pytest.raises(OutputError):

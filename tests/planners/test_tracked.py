@@ -172,7 +172,10 @@ def test_the_planner_inside_can_be_changed():
 @pytest.mark.parametrize(
     ("make", "message"),
     [
-        (lambda: TrackedPlanner(make_planner(), "kalman", control_step=STEP), "track must be a Track, .* got str"),
+        (
+            lambda: TrackedPlanner(make_planner(), "kalman", control_step=STEP),
+            "track must be a Track such as .* got str",
+        ),
         (lambda: TrackedPlanner(print, TRACK, control_step=STEP), "planner must be a planner of this package"),
         (lambda: TrackedPlanner(make_planner(), TRACK, control_step=0.0), "control_step must be >= 1e-06, got 0.0"),
         (lambda: tracked()(TensorDict({}, [2])), "TrackedPlanner reads the key 'target_pos'"),

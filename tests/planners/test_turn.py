@@ -44,7 +44,7 @@ def test_a_box_says_where_targets_are_met_and_loses_none():
     path = torch.tensor([[0.5, 0.0, 0.5], [0.5, 1.1, 0.5], [-0.1, 0.0, 0.5], [1.0, 1.0, 1.0]])
     assert box.forecast(path).tolist() == [False, True, True, False]
     assert not box.seen(path).any()
-    with pytest.raises(InputError, match="box has 3 axes, but places have 2"):
+    with pytest.raises(InputError, match="box has 3 axes, but positions have 2"):
         box.forecast(path[:, :2])
 
 
@@ -58,7 +58,7 @@ def test_a_box_says_where_targets_are_met_and_loses_none():
             lambda: DynamicPlanner(
                 PointPlanner(speed=1.0, acceleration=1.0, control_step=0.1), turn=WithTarget(), search=CornerSearch()
             ),
-            "CornerSearch knows no turn of the tool",
+            "CornerSearch does not support a turn of the tool",
         ),
     ],
 )

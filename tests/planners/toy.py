@@ -10,7 +10,7 @@ from torchdyn_plan.planners import CallablePlanner, CornerSearch, DynamicPlanner
 from torchdyn_plan.planners.planner import observe
 
 HISTORY, SPEED = 6, 0.01
-NO_MEMORY = "ignore:a planner remembers nothing:RuntimeWarning"
+NO_MEMORY = "ignore:the planner's memory is missing:RuntimeWarning"
 """For tests that show a planner rows in mid-episode and no memory, to plan at once."""
 SCHEDULE = ReplanSchedule(first_step=3, window=12, shrink=0.9, minimum=5)
 

@@ -1,9 +1,8 @@
-"""Simulated worlds as TorchRL environments; each is imported on first use."""
+"""Simulated worlds as TorchRL environments."""
 
-from __future__ import annotations
+from typing import TYPE_CHECKING
 
-from importlib import import_module
-from typing import TYPE_CHECKING, Any
+from torchdyn_plan.lazy import lazy_names
 
 if TYPE_CHECKING:
     from torchdyn_plan.envs.arm_runner import ArmRunner, EnvRunner
@@ -12,22 +11,6 @@ if TYPE_CHECKING:
     from torchdyn_plan.envs.moving_target import MovingTargetEnv, RobotReading
     from torchdyn_plan.envs.sensor import Sensor
     from torchdyn_plan.envs.trapper import TrapperEnv, TrapperGoalEnv, TrapperScene, TrapperSimulation
-
-_PLACES = {
-    "ArmRunner": "arm_runner",
-    "DynamicReachEnv": "fetch_reach",
-    "EnvRunner": "arm_runner",
-    "FetchSimulation": "fetch_reach",
-    "MovingTargetEnv": "moving_target",
-    "RobotReading": "moving_target",
-    "Sensor": "sensor",
-    "TrapperEnv": "trapper",
-    "TrapperGoalEnv": "trapper",
-    "TrapperScene": "trapper",
-    "TrapperSimulation": "trapper",
-    "draw_uniform": "episodes",
-}
-"""Module of this folder that defines each name."""
 
 __all__ = [
     "ArmRunner",
@@ -44,8 +27,14 @@ __all__ = [
     "draw_uniform",
 ]
 
-
-def __getattr__(name: str) -> Any:
-    if name not in _PLACES:
-        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
-    return getattr(import_module(f"{__name__}.{_PLACES[name]}"), name)
+__getattr__, __dir__ = lazy_names(
+    __name__,
+    {
+        "arm_runner": ("ArmRunner", "EnvRunner"),
+        "episodes": ("draw_uniform",),
+        "fetch_reach": ("DynamicReachEnv", "FetchSimulation"),
+        "moving_target": ("MovingTargetEnv", "RobotReading"),
+        "sensor": ("Sensor",),
+        "trapper": ("TrapperEnv", "TrapperGoalEnv", "TrapperScene", "TrapperSimulation"),
+    },
+)

@@ -31,23 +31,23 @@ if TYPE_CHECKING:
 class Arm(Precise):
     """A serial chain of N revolute and prismatic joints, read from a description and evaluated in closed form.
 
-    It computes in float32 or float64; ``half()`` leaves it in float32.
-    The buffers ``lower``, ``upper`` (N,) [rad; m] and ``speed_limit`` (N,) [rad/s; m/s] hold the joints' limits; a
-    speed limit missing in the description is infinite; `needed_speed_limit` raises if it is.
+    It computes in float32 or float64; ``half()`` leaves it in float32. The buffers ``lower``, ``upper`` (N,) [rad; m]
+    and ``speed_limit`` (N,) [rad/s; m/s] hold the joints' limits. A speed limit missing in the description is infinite,
+    and `needed_speed_limit` raises if it is.
 
-    Where one joint of the chain moves with another, at ratio · q + shift (`Coupling`), the arm has one position for
-    both, named after the joint that moves the other, with limits that hold for both.
+    If one joint of the chain moves with another, at ratio · q + shift (`Coupling`), the arm has one position for both,
+    named after the driving joint, with limits that hold for both.
 
-    ``joint_names``, ``joint_kinds`` and ``full_turns`` (whether a full turn leaves the pose as it is) describe the N
+    ``joint_names``, ``joint_kinds`` and ``full_turns`` (whether a full turn leaves the pose unchanged) describe the N
     positions.
 
-    ``form`` says how the arm is evaluated; all forms are exact, and the attribute of that name does the work:
+    ``form`` selects how the arm is evaluated; all forms are exact, and the attribute of that name holds the one in use:
 
-    - ``"sines"``: pose and Jacobian as one product of sines, the fastest as long as there are few of them: 81 for a
-      UR5, about a thousand for a general seven-joint arm, and never more than `trigonometric.MOST_TERMS` terms.
-      Prismatic joints must come before the revolute ones.
-    - ``"transforms"``: the product of a few transforms, each of some neighbouring joints and itself made of sines.
-    - ``"auto"`` (default): sines, unless there would be more than `forms.MOST_SINES` of them or there cannot be any.
+    - ``"sines"``: pose and Jacobian as one product of sines, the fastest if there are few of them: 81 for a UR5, about
+      a thousand for a general seven-joint arm, and at most `trigonometric.MOST_TERMS` terms. Prismatic joints must come
+      before the revolute ones.
+    - ``"transforms"``: a product of a few transforms, each over some neighbouring joints and made of sines itself.
+    - ``"auto"`` (default): sines, unless there are more than `forms.MOST_SINES` of them or the chain has no such form.
 
     ``components`` is the same in a form for compilers, see `ComponentForm`.
     """
@@ -68,7 +68,7 @@ class Arm(Precise):
     ) -> None:
         """Build from ``joints``, base to tip.
 
-        Where offsets of joints or the tool require gradients, pose and Jacobian have gradients in them.
+        If joint offsets or the tool require gradients, pose and Jacobian have gradients with respect to them.
 
         Args:
             joints: base to tip.
@@ -79,8 +79,8 @@ class Arm(Precise):
             device: CPU by default.
 
         Raises:
-            InputError: no joint moves, a joint's numbers cannot be, the form is unknown, a prismatic joint cannot be
-                had in sines, or there would be too many of them.
+            InputError: no joint moves, a joint's numbers are invalid, the form is unknown, a prismatic joint has no
+                form in sines, or there would be too many sines.
         """
         super().__init__()
         check_choice("form", form, FORMS)
@@ -107,7 +107,7 @@ class Arm(Precise):
         self.to(device=device, dtype=dtype)
 
     def part_settings(self) -> dict[str, Any]:
-        """Arguments of the constructor that make the same arm, on the CPU."""
+        """Constructor arguments of this arm, on the CPU."""
         return {**self._made_from, "dtype": self.lower.dtype}
 
     @classmethod
@@ -121,7 +121,7 @@ class Arm(Precise):
     ) -> Arm:
         """The UR5 with its tool frame ``tool_length`` [m] in front of the flange, along the flange's z axis.
 
-        ``speed_limit`` is that of every joint [rad/s].
+        ``speed_limit`` holds for every joint [rad/s].
         """
         return cls.from_urdf(ur5_urdf(tool_length), tip="tool", speed_limit=speed_limit, dtype=dtype, device=device)
 
@@ -129,7 +129,7 @@ class Arm(Precise):
     def from_urdf(cls, source: Source, *, tip: str, base: str | None = None, **options: Any) -> Arm:
         """The arm from the link ``base`` (default: the root) to the link ``tip`` of URDF.
 
-        Nothing but the joints between the two is read, and joints that these mimic.
+        Only the joints between the two are read, and joints that these mimic.
 
         Args:
             source: the text, or the path of its file.
@@ -146,31 +146,31 @@ class Arm(Precise):
     def from_mjcf(cls, source: MjcfSource, *, tip: str, base: str | None = None, **options: Any) -> Arm:
         """The arm from the body ``base`` (default: the world) to the body or site ``tip`` of MJCF.
 
-        MuJoCo itself, which the extra ``sim`` brings, reads the scene, in which anything else may be. Of a site and a
-        body that share a name, ``tip`` is the site; ``body:name`` and ``site:name`` say which. What has no name is
-        called by its index in the compiled model, as in ``joint#3``. Joints that an equality of two joints, or of
-        fixed tendons over two joints, holds together are one; the limits of tendons, and bodies that are welded or
-        connected, are left to MuJoCo. MJCF knows no speed limits.
+        MuJoCo (extra ``sim``) reads the scene, which may contain anything else. If a site and a body share a name,
+        ``tip`` is the site; use ``body:name`` or ``site:name`` to choose. Elements without a name are called by their
+        index in the compiled model, such as ``joint#3``. Joints coupled by an equality of two joints, or of fixed
+        tendons over two joints, count as one; tendon limits, and weld and connect constraints, are ignored. MJCF has no
+        speed limits.
 
         Args:
-            source: the text, the path of its file (beside which MuJoCo finds meshes and included files), an `MjSpec` or
-                an `MjModel`.
+            source: the text, the path of its file (whose folder is searched for meshes and includes), an `MjSpec` or an
+                `MjModel`.
             tip: body or site whose frame is the tool's.
             base: body whose frame is the base frame.
             options: of the constructor; ``tool`` is a pose in the frame of the tip.
 
         Raises:
-            InputError: as of `from_urdf`.
+            InputError: see `from_urdf`.
         """
         return cls(joints_of_mjcf(source, base=base, tip=tip), **options)
 
     @classmethod
     def from_chain(cls, chain: pytorch_kinematics.SerialChain, **options: Any) -> Arm:
-        """The arm of a chain that pytorch-kinematics has parsed, as precise as the chain (float32 by default)."""
+        """The arm of a chain parsed by pytorch-kinematics, at the chain's precision (float32 by default)."""
         return cls(joints_of_chain(chain), **options)
 
     def needed_speed_limit(self, owner: str) -> Tensor:
-        """``speed_limit``, for ``owner``, which cannot do without.
+        """``speed_limit``, for an ``owner`` that requires it.
 
         Raises:
             InputError: a joint has none.
@@ -198,7 +198,7 @@ class Arm(Precise):
         Raises:
             InputError: ``joint_pos`` is not ``(*B, N)``, or of another device or precision than the arm.
         """
-        # A module's attribute that is a module takes as long to look up as a small operation.
+        # Looking up a submodule as an attribute costs as much as a small operation.
         form: Any = self._modules["form"]
         self.check(joint_pos)
         if joint_pos.ndim == 2:
@@ -231,7 +231,7 @@ def _tool(pose: Tensor | Sequence[Sequence[float]]) -> Tensor:
     fixed = tool.detach()
     off = fixed[:3, :3] @ fixed[:3, :3].T - torch.eye(3, dtype=torch.float64)
     if off.abs().max() > 1e-5 or torch.linalg.det(fixed[:3, :3]) < 0.0 or fixed[3].tolist() != [0.0, 0.0, 0.0, 1.0]:
-        raise InputError(f"tool must be a rotation and a place, over a row of 0, 0, 0, 1, got {fixed.tolist()}")
+        raise InputError(f"tool must be a rotation and a position, over a row of 0, 0, 0, 1, got {fixed.tolist()}")
     return tool
 
 
@@ -241,7 +241,7 @@ def _speed_limits(joints: Sequence[Joint], given: float | Sequence[float] | None
         return [joint.speed_limit for joint in joints]
     values = [given] * len(joints) if isinstance(given, (int, float)) else list(given)
     if len(values) != len(joints):
-        raise InputError(f"speed_limit must be one number or {len(joints)}, one for each joint, got {len(values)}")
+        raise InputError(f"speed_limit must be one number, or {len(joints)}, one for each joint, got {len(values)}")
     limited = [replace(joint, speed_limit=float(value)) for joint, value in zip(joints, values, strict=True)]
     for joint in limited:
         check_limits(joint)

@@ -1,4 +1,4 @@
-"""Inverse kinematics where TorchRL's users meet it: a `CartesianSolver`, as its macro actions of robots ask for."""
+"""Inverse kinematics for TorchRL: a `CartesianSolver` for its robot macro actions."""
 
 from __future__ import annotations
 
@@ -10,22 +10,22 @@ from torch import Tensor
 from torchdyn_plan.checks import check_number, check_same_device, check_trailing_shape
 from torchdyn_plan.errors import InputError
 from torchdyn_plan.kinematics.arm import Arm
-from torchdyn_plan.kinematics.follow import follow_rows, following
 from torchdyn_plan.kinematics.solver import ROUNDS, IKResult, check_task, inside_limits, solve_rows
 from torchdyn_plan.kinematics.targets import is_pose, rotation_matrix, rotation_vector
+from torchdyn_plan.kinematics.trajectory import follow_rows, following
 from torchdyn_plan.precision import Precise, without_autocast
 
 SOLUTIONS = 4
-"""Solutions of a pose of which the nearest is taken."""
+"""Number of solutions searched for each pose; the nearest is taken."""
 NO_TURN = (1.0, 0.0, 0.0, 0.0)
 
 
 class ArmSolver(Precise):
-    """An arm's inverse kinematics by TorchRL's protocol ``torchrl.envs.CartesianSolver``, for whole batches.
+    """Batched inverse kinematics of an arm with TorchRL's protocol ``torchrl.envs.CartesianSolver``.
 
-    It is given to ``URScriptPrimitiveTransform(cartesian_solver=…)``. An action is the arm's joint positions and a last
-    entry for the gripper, which is passed through. Where a pose is not reached the action is the nearest that was
-    found; `solve` says so, row by row.
+    Pass it to ``URScriptPrimitiveTransform(cartesian_solver=…)``. An action is the arm's joint positions and a last
+    entry for the gripper, which is passed through. If a pose is not reached the action is the nearest one found;
+    `solve` returns the status of each row.
     """
 
     base: Tensor
@@ -42,10 +42,10 @@ class ArmSolver(Precise):
         """Solve for ``arm``.
 
         Args:
-            arm: whose tool is brought to the poses.
+            arm: the arm, whose tool is brought to the poses.
             base: ``(4, 4)``, the arm's base frame in the world [m]; the world itself by default.
             position_tolerance: [m]
-            rotation_tolerance: [rad], as the mask weighs it.
+            rotation_tolerance: [rad], weighted by the mask.
             iterations: most steps from one start.
 
         Raises:
@@ -53,7 +53,7 @@ class ArmSolver(Precise):
         """
         super().__init__()
         if not isinstance(arm, Arm):
-            raise InputError(f"arm must be an Arm, as from Arm.from_urdf or Arm.ur5, got {type(arm).__name__}")
+            raise InputError(f"arm must be an Arm, such as Arm.ur5() or Arm.from_urdf(...), got {type(arm).__name__}")
         check_task("pose", 1, position_tolerance, rotation_tolerance, iterations)
         place = torch.eye(4, dtype=torch.float64) if base is None else base
         good = isinstance(place, Tensor) and place.shape == (4, 4) and place.is_floating_point()
@@ -74,12 +74,12 @@ class ArmSolver(Precise):
         """The action, or the actions of a straight path, that bring the tool to ``target_pose``.
 
         Args:
-            target_pose: ``(*B, 7)``, position [m] and quaternion wxyz in the world; a quaternion that is none leaves
-                the orientation free.
-            start_action: ``(*B, N + 1)``, from which the search starts [rad; m].
-            orientation_mask: ``(*B, 3)``, weights of the rotations about the world's axes, of which 0 leaves one free;
-                rows with a NaN or an infinity have none.
-            waypoints: number of poses along the straight way from where the tool is, all of which are met.
+            target_pose: ``(*B, 7)``, position [m] and quaternion wxyz in the world; an invalid quaternion leaves the
+                orientation free.
+            start_action: ``(*B, N + 1)``, start of the search [rad; m].
+            orientation_mask: ``(*B, 3)``, weights of the rotations about the world's axes; 0 leaves an axis free. Rows
+                with a NaN or an infinity have no mask.
+            waypoints: number of poses along the straight line from the tool's position, all of which are met.
 
         Returns:
             ``(*B, N + 1)``, or ``(*B, waypoints, N + 1)``.
@@ -100,7 +100,7 @@ class ArmSolver(Precise):
         orientation_mask: Tensor | None = None,
         waypoints: int | None = None,
     ) -> IKResult:
-        """As `forward`, the joints alone with their status and residuals, as of `solve_ik` or of `follow`."""
+        """Like `forward`, but returns the joints with status and residuals, as `solve_ik` and `follow` do."""
         batch, like = self._check(target_pose, start_action, orientation_mask, waypoints), self.arm.lower
         pose = target_pose.reshape(-1, 7).to(like)
         mask = None if orientation_mask is None else orientation_mask.reshape(-1, 3).to(like)
@@ -112,7 +112,7 @@ class ArmSolver(Precise):
     def _solve(
         self, pose: Tensor, start: Tensor, mask: Tensor | None, waypoints: int | None
     ) -> tuple[Tensor, Tensor, Tensor]:
-        """For rows ``(M, …)``; of a path, ``(M, waypoints, …)``."""
+        """`solve` for rows ``(M, …)``; for a path, ``(M, waypoints, …)``."""
         target, weights = self._targets(pose, mask)
         search = following(self.arm, "pose", 1, self.tolerances, self.iterations)._replace(weights=weights)
         first = inside_limits(self.arm, start)
@@ -123,7 +123,7 @@ class ArmSolver(Precise):
         return q[:, 0], status[:, 0], residual[:, 0]
 
     def _targets(self, pose: Tensor, mask: Tensor | None) -> tuple[Tensor, Tensor | None]:
-        """Poses ``(M, 4, 4)`` in the arm's base frame, weights ``(M, 6, 6)`` of their errors; None where all are 1."""
+        """Poses ``(M, 4, 4)`` in the arm's base frame, and weights ``(M, 6, 6)`` of their errors, None if all are 1."""
         turned = pose[:, 3:].square().sum(dim=-1).sqrt()
         oriented = turned.isfinite() & (turned > 1e-6)
         eye = torch.eye(4, dtype=pose.dtype, device=pose.device).repeat(len(pose), 1, 1)
@@ -137,7 +137,7 @@ class ArmSolver(Precise):
         if bool((weigh == 1.0).all()):
             return target, None
         weights = torch.eye(6, dtype=pose.dtype, device=pose.device).repeat(len(pose), 1, 1)
-        # Errors are told in the base frame, and weighed about the world's axes.
+        # Errors are in the base frame, weights about the world's axes.
         weights[:, 3:, 3:] = weigh.unsqueeze(-1) * self.base[:3, :3]
         return target, weights
 
@@ -159,7 +159,7 @@ class ArmSolver(Precise):
 
 
 def _straight(start: Tensor, target: Tensor, count: int) -> Tensor:
-    """Poses ``(M, count, 4, 4)`` on the straight way from ``start`` to ``target`` (M, 4, 4), without the start."""
+    """Poses ``(M, count, 4, 4)`` on the straight line from ``start`` to ``target`` (M, 4, 4), without the start."""
     share = torch.arange(1, count + 1, dtype=start.dtype, device=start.device).unsqueeze(-1) / count
     path = target.unsqueeze(1).repeat(1, count, 1, 1)
     turn = rotation_vector(target[:, :3, :3] @ start[:, :3, :3].mT)

@@ -1,4 +1,4 @@
-"""What the readers of arms' descriptions share, and joints out of a chain that pytorch-kinematics has parsed."""
+"""Shared code of the URDF and MJCF readers, and joints from a chain parsed by pytorch-kinematics."""
 
 from __future__ import annotations
 
@@ -18,9 +18,9 @@ if TYPE_CHECKING:
     import pytorch_kinematics
 
 Source = str | bytes | PathLike[str]
-"""A description: its text, or the path of its file. Text holds a ``<``, and no path does."""
+"""A description: its text, or the path of its file. Text contains a ``<``, a path does not."""
 HANDLED = "fixed, revolute and prismatic joints"
-"""What an arm can be made of, in words."""
+"""Supported joints, for messages."""
 
 
 def file_or_text(source: Source, language: str) -> Path | str | bytes:
@@ -41,7 +41,7 @@ def file_or_text(source: Source, language: str) -> Path | str | bytes:
 
 
 def joints_of_chain(chain: pytorch_kinematics.SerialChain) -> list[Joint]:
-    """Joints of a chain that pytorch-kinematics has parsed, at the chain's own precision."""
+    """Joints of a chain parsed by pytorch-kinematics, at the chain's precision."""
     joints = []
     for frame in chain._serial_frames:
         joint, before = frame.joint, _fixed_part(frame.link) @ _fixed_part(frame.joint)
@@ -54,7 +54,7 @@ def joints_of_chain(chain: pytorch_kinematics.SerialChain) -> list[Joint]:
 def make_joint(
     name: str, kind: Kind, before: Tensor, axis: Any, *, limits: Sequence[float] | None, speed: float | None
 ) -> Joint:
-    """A joint as a description has it; a speed of 0 means that none was given."""
+    """A joint from a description; a speed of 0 means that none is given."""
     if kind == "fixed":
         return Joint(offset=before, name=name)
     lower, upper = map(float, limits or (-math.inf, math.inf))
@@ -63,7 +63,7 @@ def make_joint(
 
 
 def unit_axis(name: str, axis: Any) -> Tensor:
-    """Direction ``(3,)`` float64 of length 1; `InputError` where ``axis`` has none."""
+    """Unit vector ``(3,)`` float64 along ``axis``; raises `InputError` if it has no direction."""
     direction = torch.as_tensor(axis, dtype=torch.float64)
     length = direction.norm()
     if not 0.0 < float(length) < math.inf:

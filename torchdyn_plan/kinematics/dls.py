@@ -15,9 +15,9 @@ def dls_step(jacobian: Tensor, error: Tensor, damping: float | Tensor, *, prefer
 
     Args:
         jacobian: ``(*B, R, N)``, rows [v; ω] or the constrained ones among them.
-        error: ``(*B, R)``, the twist still to go [m; rad].
+        error: ``(*B, R)``, the remaining twist [m; rad].
         damping: λ > 0, a number or ``(*B,)``; at a singular configuration it bounds the step by ``|e| / 2λ``.
-        preferred: ``(*B, N)``, a step of which the part is added that the constraint leaves free (Liégeois 1977).
+        preferred: ``(*B, N)``, a step whose projection onto the null space is added (Liégeois 1977).
 
     Returns:
         ``(*B, N)`` [rad].
@@ -62,16 +62,16 @@ def limited_step(step: Tensor, limit: Tensor, gain: float) -> Tensor:
 
 
 def braked_step(step: Tensor, limit: Tensor, brake: Tensor) -> Tensor:
-    """Shorten ``step`` (*B, N) so that every joint can still stop where the whole of it leads, all in proportion.
+    """Scale ``step`` (*B, N) down so that every joint can still stop at the end of the whole step.
 
-    A joint that goes u in a control step and then brakes stops after u + u²/2b, with b what it can change its step by:
+    A joint that moves u in a control step and then brakes stops after u + u²/2b, with b the change of step it can make:
 
         u = -b + √(b² + 2 b e),  which tends to e where that is small.
 
     Args:
-        step: ``(*B, N)``, the way e that is left.
-        limit: ``(N,)``, the most that a joint moves in a control step.
-        brake: ``(N,)``, the most that this changes by from one step to the next.
+        step: ``(*B, N)``, the remaining motion e.
+        limit: ``(N,)``, the largest motion of a joint in a control step.
+        brake: ``(N,)``, the largest change of that motion from one step to the next.
     """
     way = step.abs()
     allowed = ((brake.square() + 2.0 * brake * way).sqrt() - brake).minimum(limit)
@@ -89,10 +89,10 @@ def dls_step_within(  # noqa: PLR0917  # As of `dls_step`, and the limits.
     *,
     preferred: Tensor | None = None,
 ) -> Tensor:
-    """`dls_step` for rows ``(M, …)``, by the joints that may move.
+    """`dls_step` for rows ``(M, …)`` within joint limits.
 
-    A joint at its limit that would be pushed out is removed, and the step of its row is solved again: the others do
-    the whole of the work, not what such a joint leaves to them.
+    A joint at its limit that would be pushed out is removed, and the step of its row is solved again, so that the other
+    joints do all of the work.
 
     Args:
         jacobian: ``(M, R, N)``

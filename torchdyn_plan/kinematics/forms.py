@@ -1,4 +1,4 @@
-"""The two ways in which an arm is evaluated: one product of sines, or a product of a few transforms made of sines."""
+"""The two forms in which an arm is evaluated: one product of sines, or a product of a few transforms made of sines."""
 
 from __future__ import annotations
 
@@ -21,13 +21,13 @@ from torchdyn_plan.kinematics.trigonometric import (
 from torchdyn_plan.precision import Precise, autocast_is_on, without_autocast
 
 MOST_SINES = 128
-"""More sines than this in one product cost more than a product of transforms."""
+"""With more sines than this, one product costs more than a product of transforms."""
 MOST_TERMS = 2 * MOST_SINES + 1
-"""A series of more terms than this has more than `MOST_SINES` sines: one at least for each pair of frequencies ±k."""
+"""A series with more terms than this has more than `MOST_SINES` sines: at least one for each pair of frequencies ±k."""
 SINES_OF_A_JOINT = 9
-"""A long chain may have this many sines for each of its joints: three joints make a transform of 26."""
+"""Sines allowed per joint in a long chain: three joints make a transform of 26."""
 LONGEST_PART = 12
-"""Joints that one transform is made of at most."""
+"""Most joints in one transform."""
 
 
 class SineForm(Precise):
@@ -41,9 +41,9 @@ class SineForm(Precise):
     _jacobian_slopes: Tensor | None
 
     def __init__(self, form: TrigonometricForm) -> None:
-        """Lay the entries of ``form`` out as a pose ``(4, 4)`` and a Jacobian ``(6, N)``.
+        """Arrange the entries of ``form`` as a pose ``(4, 4)`` and a Jacobian ``(6, N)``.
 
-        Two small matrix products take less time than splitting the result of one.
+        Two small matrix products are faster than splitting the result of one.
         """
         super().__init__()
         self.num_joints = len(form.frequencies)
@@ -59,7 +59,7 @@ class SineForm(Precise):
         """Pose ``(B, 4, 4)`` alone, for ``(B, N)``."""
         if autocast_is_on():
             return without_autocast(self.forward, joint_pos)
-        # A module's attribute that is a buffer takes as long to look up as a small operation; its table does not.
+        # Looking up a buffer as a module's attribute costs as much as a small operation; its table is cheaper.
         own = cast(dict[str, Tensor], self._buffers)
         sines = torch.addmm(own["_phases"], joint_pos, own["_frequencies"]).sin()
         pose = torch.mm(sines, own["_pose_weights"])
@@ -91,7 +91,7 @@ class TransformForm(Precise):
     _last_row: Tensor
 
     def __init__(self, forms: Sequence[TrigonometricForm]) -> None:
-        """Put the transforms, base to tip, side by side: all their sines are taken at once."""
+        """Concatenate the transforms, base to tip, so that all their sines are computed at once."""
         super().__init__()
         self.counts = tuple(len(form.frequencies) for form in forms)
         _register(self, "_frequencies", torch.block_diag(*(form.frequencies for form in forms)))
@@ -116,7 +116,7 @@ class TransformForm(Precise):
     def pose_and_jacobian(self, joint_pos: Tensor) -> tuple[Tensor, Tensor]:
         """Pose ``(B, 4, 4)`` and Jacobian ``(B, 6, N)``, for ``(B, N)``.
 
-        A transform behind another is turned by it, and lengthens its joints' levers: v = v₁ + ω₁ × (R₁p₂).
+        A transform after another is rotated by it, and lengthens the levers of its joints: v = v₁ + ω₁ × (R₁p₂).
         """
         if autocast_is_on():
             return without_autocast(self.pose_and_jacobian, joint_pos)
@@ -153,9 +153,9 @@ def sine_form(joints: Sequence[Joint], tool: Tensor) -> SineForm:
 
 
 def transform_form(joints: Sequence[Joint], tool: Tensor) -> TransformForm:
-    """The chain as the product of the fewest transforms that have, in all, at most `MOST_SINES` sines.
+    """The chain as the product of the fewest transforms with at most `MOST_SINES` sines in total.
 
-    A chain of more than 14 joints may have `SINES_OF_A_JOINT` for each.
+    A chain of more than 14 joints may have `SINES_OF_A_JOINT` for each joint.
     """
     negligible, most = _negligible(joints, tool), max(MOST_SINES, SINES_OF_A_JOINT * len(joints))
     cuts = best_cuts(len(joints), _sines_of_parts(joints, tool, negligible), most)
@@ -167,12 +167,12 @@ def transform_form(joints: Sequence[Joint], tool: Tensor) -> TransformForm:
 
 
 def best_form(joints: Sequence[Joint], tool: Tensor) -> SineForm | TransformForm:
-    """One product of sines where the chain has one of at most `MOST_SINES` sines, else a product of transforms."""
+    """One product of sines if it has at most `MOST_SINES` sines, else a product of transforms."""
     negligible = _negligible(joints, tool)
     if len(joints) > MOST_COUNTABLE:
         return transform_form(joints, tool)
     try:
-        # The first joints alone tell of a chain whose whole expansion would be large.
+        # The first joints already show that the whole expansion would be large.
         for count in sine_counts(joints, repeat(tool), negligible=negligible, most=MOST_TERMS):
             if count > MOST_SINES:
                 return transform_form(joints, tool)
@@ -184,13 +184,14 @@ def best_form(joints: Sequence[Joint], tool: Tensor) -> SineForm | TransformForm
 def best_cuts(count: int, sines: dict[tuple[int, int], int], most: int) -> tuple[int, ...]:
     """Where to cut a chain of ``count`` joints: into the fewest parts, at least two, with no more than ``most`` sines.
 
-    Of as many parts those with the fewest sines are taken, and of these the first in order; if all cuts have more than
-    ``most``, those with the fewest. By dynamic programming over the number of parts and the first joint of a tail.
+    Among cuts into equally many parts, the one with the fewest sines is taken, and of equals the first; if all cuts
+    have more than ``most``, the one with the fewest. Dynamic programming over the number of parts and the first joint
+    of a tail.
 
     Args:
-        count: joints.
-        sines: of each part that can be had, by its first joint and the one behind its last.
-        most: sines in all.
+        count: number of joints.
+        sines: number of sines of each possible part, by its first joint and the one after its last.
+        most: most sines in total.
 
     Returns:
         First joints of all parts, and ``count``.
@@ -209,7 +210,7 @@ def best_cuts(count: int, sines: dict[tuple[int, int], int], most: int) -> tuple
             best = tails[0]
         if best is not None and best[0] <= most:
             break
-    assert best is not None  # Each joint is a part of its own, at the least.
+    assert best is not None  # At least the cut with one joint in each part exists.
     return best[1]
 
 
@@ -218,11 +219,11 @@ FORMS: dict[str, Callable[[Sequence[Joint], Tensor], SineForm | TransformForm]] 
     "sines": sine_form,
     "transforms": transform_form,
 }
-"""Name of each form of an arm, and what makes it."""
+"""The function that makes each form of an arm, by name."""
 
 
 def _slopes(form: TrigonometricForm) -> Tensor:
-    """What the joints add that is linear, ``(N, 12 + 6N)``."""
+    """The linear terms of the joints, ``(N, 12 + 6N)``."""
     if form.slopes is not None:
         return form.slopes.flatten(1)
     return torch.zeros(len(form.frequencies), form.constant.numel(), dtype=torch.float64)
@@ -244,12 +245,12 @@ def _sines_of_parts(joints: Sequence[Joint], tool: Tensor, negligible: float) ->
 
 
 def _behind(joints: Sequence[Joint], stop: int, tool: Tensor) -> Tensor:
-    """What comes behind the part of a chain that ends at joint ``stop``, before the next joint's own offset."""
+    """The transform after the part of a chain that ends at joint ``stop``, before the next joint's offset."""
     return tool if stop == len(joints) else torch.eye(4, dtype=torch.float64)
 
 
 def _negligible(joints: Sequence[Joint], tool: Tensor) -> float:
-    """Below what terms are dropped: none where offsets have gradients, since a term that is zero may have a slope."""
+    """Threshold for dropping terms: 0 if offsets have gradients, because a term of 0 may have a non-zero gradient."""
     graded = tool.requires_grad or any(joint.offset.requires_grad for joint in joints)
     return -1.0 if graded else NEGLIGIBLE
 

@@ -1,4 +1,4 @@
-"""Derivatives of a solved inverse kinematics, by the implicit function theorem and not through the solver's steps."""
+"""Gradients of inverse kinematics by the implicit function theorem, not through the solver's steps."""
 
 from __future__ import annotations
 
@@ -13,15 +13,15 @@ from torchdyn_plan.kinematics.targets import constraint_error, constraint_jacobi
 def refine(
     arm: Arm, target: Tensor, solution: Tensor, solved: Tensor, *, constraint: str = "pose", symmetry: int = 1
 ) -> Tensor:
-    """``solution`` once more, with derivatives in ``target`` and in the arm's own tensors.
+    """``solution`` with gradients with respect to ``target`` and the arm's own tensors.
 
     The error e(q, θ) of a solution is 0, so dq/dθ = -J⁺ ∂e/∂θ. That is the derivative of one Newton step taken at a
-    constant q, and of two such steps up to the third order; so two steps are taken, which besides bring the solution
-    within rounding of its target. They work under autograd and every transform of ``torch.func``.
+    constant q, and of two such steps up to the third order. Two steps are taken, which also bring the solution to its
+    target within rounding. They work under autograd and every transform of ``torch.func``.
 
-    - Redundant arms: of all motions that follow the target, the derivative is the smallest.
-    - Singularities: J⁺ is damped with λ² = √ε, so that along a direction that is lost the derivative tends to 0 instead
-      of infinity; where a singular value is σ, it falls short by λ²/σ², 1 part in a thousand at σ = 0.004 in float64.
+    - Redundant arms: the derivative is the smallest of all motions that follow the target.
+    - Singularities: J⁺ is damped with λ² = √ε, so that along a lost direction the derivative tends to 0 instead of
+      infinity; at a singular value σ it is too small by λ²/σ², 1 part in a thousand at σ = 0.004 in float64.
     - Joints at their limits do not move: their derivative is 0, and the others follow the target as well as they can.
     - Rows that were not solved keep their ``solution``, with derivative 0.
 

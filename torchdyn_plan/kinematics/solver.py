@@ -1,4 +1,4 @@
-"""Inverse kinematics for batches of targets: damped least squares from several starts, each row on its own."""
+"""Batched inverse kinematics: damped least squares with several starts; rows are independent."""
 
 from __future__ import annotations
 
@@ -14,19 +14,19 @@ from torch import Tensor
 from torchdyn_plan.checks import check_choice, check_number
 from torchdyn_plan.errors import InputError
 from torchdyn_plan.kinematics.arm import Arm
-from torchdyn_plan.kinematics.branches import NUMBER, Universal, all_branches, tool_turns, universal
 from torchdyn_plan.kinematics.descent import Search, descend, evaluate, residual_at, rows_at
 from torchdyn_plan.kinematics.implicit import refine
 from torchdyn_plan.kinematics.nearest import TURN, first_distinct, reduced, revolute, speeds, travel, turned_towards
 from torchdyn_plan.kinematics.targets import CONSTRAINTS, as_pose, as_rows, is_pose
+from torchdyn_plan.kinematics.ur_branches import NUMBER, Universal, all_branches, tool_turns, universal
 from torchdyn_plan.precision import without_autocast
 
 ROUNDS = (1, 4, 16, 64, 128)
-"""Starts that a row still unsolved is given, side by side, in each round."""
+"""Parallel starts for each unsolved row, in each round."""
 LEAST_TOLERANCE = 1e-12
-"""[m; rad]; below it, nothing is ever solved."""
+"""[m; rad]; smaller tolerances can never be met."""
 OVERSHOOT = 0.1
-"""[rad; m]; a start that is further outside its limits is turned by 2π where that brings it inside."""
+"""[rad; m]; a start farther outside its limits than this is turned by 2π if that brings it inside."""
 
 
 class IKStatus(IntEnum):
@@ -37,20 +37,20 @@ class IKStatus(IntEnum):
     UNREACHED = 1
     """No start came within the tolerances."""
     SINGULAR = 2
-    """As `UNREACHED`, in a singular configuration: stretched out to a target beyond its reach, or axes in line."""
+    """Like `UNREACHED`, in a singular configuration: stretched out to a target beyond its reach, or axes in line."""
     LIMITED = 3
-    """As `UNREACHED`, with a joint at its limit."""
+    """Like `UNREACHED`, with a joint at its limit."""
     INVALID = 4
     """The target or the start is NaN or infinite, or the target's rotation is not one; nothing was solved."""
     LATE = 5
-    """Not there yet, with a joint at its speed limit; of `follow` alone."""
+    """Not there yet, with a joint at its speed limit; only from `follow`."""
 
 
 class IKResult(NamedTuple):
     """Result of `solve_ik`; with ``solutions=k`` each entry has a dimension ``k`` after the batch."""
 
     q: Tensor
-    """``(*B, N)`` [rad; m]; the nearest that was found where the row is not solved, the start where it is invalid."""
+    """``(*B, N)`` [rad; m]; the best found if the row is not solved, the start if it is invalid."""
     status: Tensor
     """``(*B,)``, integers of `IKStatus`."""
     residual: Tensor
@@ -58,18 +58,18 @@ class IKResult(NamedTuple):
 
 
 class _Pool(NamedTuple):
-    """The best that each row has found so far, ``K`` of them, the first the nearest to the start."""
+    """The best ``K`` solutions that each row has found so far, the nearest to the start first."""
 
     q: Tensor
     """``(M, K, N)``"""
     residual: Tensor
-    """``(M, K, 2)``, infinite in places that are still empty."""
+    """``(M, K, 2)``, infinite in empty slots."""
     start: Tensor
-    """``(M, N)``, to which they are near."""
+    """``(M, N)``, the start."""
     speed: Tensor
     """``(N,)``, see `nearest.speeds`."""
     turns: Tensor
-    """``(N,)`` bool, joints that are the same after a whole turn."""
+    """``(N,)`` bool, joints for which a whole turn changes nothing."""
 
 
 def solve_ik(
@@ -91,15 +91,15 @@ def solve_ik(
 ) -> IKResult:
     """Joint positions at which the tool is at ``target``, by damped least squares with restarts.
 
-    Rows are independent: bad rows are marked by their status, and a row alone has the same solution as in a batch.
-    The starts after the first are the same for every row. Whole poses of arms of the UR family are solved by
-    `branches` first, unless ``rounds`` is one alone. Joints are turned by 2π towards the start as far as their limits
-    allow, and the solution that all joints reach soonest at their speed limits is taken (if the arm lacks some limits,
-    the one with the least rotation).
+    Rows are independent: bad rows are marked by their status, and a single row has the same solution as in a batch. The
+    starts after the first are the same for every row. Full poses of UR arms are first solved by `branches`, unless
+    ``rounds`` is a single start. Joints are turned by 2π towards the start as far as their limits allow, and the
+    solution that all joints reach soonest at their speed limits is taken (if some speed limits are missing, the one
+    with the least rotation).
 
-    With ``solutions=k`` a row has up to ``k`` of them that differ, the nearest first. Those that were not found have a
-    status other than `SOLVED` and are copies of the first, with infinite residuals. All starts of a round then go to
-    their ends, and further rounds are made until there are ``k``; an arm of the UR family has 8 at most, all known.
+    With ``solutions=k`` a row has up to ``k`` distinct solutions, the nearest first. Missing ones have a status other
+    than `SOLVED` and are copies of the first, with infinite residuals. In this case all starts of a round run to the
+    end, and further rounds follow until there are ``k``; a UR arm has at most 8 solutions, all known.
 
     Args:
         arm: the arm.
@@ -107,14 +107,14 @@ def solve_ik(
         q0: start of the first round, ``(*B, N)`` or ``(N,)``; a fixed one by default. It is clamped to
             the limits.
         constraint: "pose", "axis" (position and direction of the tool's z axis; yaw is free) or "position".
-        symmetry: for the constraint "pose", the tool is the same after one ``symmetry``-th of a turn about its z axis.
+        symmetry: for the constraint "pose", order of the tool's rotational symmetry about its z axis.
         position_tolerance: [m]
         rotation_tolerance: [rad]
         iterations: most steps from one start.
-        rounds: number of starts, side by side, in each round; rows solved in one do not enter the next.
-        max_step: most that any joint moves in one step, a number or ``(N,)`` [rad; m].
-        max_move: most that any joint may be away from ``q0`` at the end, a number or ``(N,)`` [rad; m].
-        posture: ``(*B, N)`` or ``(N,)``, preferred joint positions for the freedom that the constraint leaves.
+        rounds: number of parallel starts in each round; rows solved in one round skip the next.
+        max_step: largest motion of any joint in one step, a number or ``(N,)`` [rad; m].
+        max_move: largest distance of any joint from ``q0`` at the end, a number or ``(N,)`` [rad; m].
+        posture: ``(*B, N)`` or ``(N,)``, preferred joint positions in the null space of the constraint.
         solutions: number of solutions per row; ``q`` is then ``(*B, k, N)``, and the others likewise.
         differentiable: give ``q`` gradients with respect to ``target`` and the arm's tensors, see `implicit.refine`.
 
@@ -153,7 +153,7 @@ def solve_ik(
 def check_task(
     constraint: str, symmetry: int, position_tolerance: float, rotation_tolerance: float, iterations: int
 ) -> None:
-    """Raise `InputError` unless these are what `solve_ik` and `follow` take."""
+    """Raise `InputError` unless these are valid arguments of `solve_ik` and `follow`."""
     check_choice("constraint", constraint, CONSTRAINTS)
     check_number("symmetry", symmetry, minimum=1, integer=True)
     check_number("position_tolerance", position_tolerance, minimum=LEAST_TOLERANCE)
@@ -172,9 +172,9 @@ def joint_numbers(name: str, value: float | Tensor, arm: Arm) -> Tensor:
 
 
 def inside_limits(arm: Arm, q: Tensor) -> Tensor:
-    """``q`` (*B, N) within the limits: the same pose where whole turns bring it there, else the nearest position.
+    """``q`` (*B, N) within the limits: the same pose if whole turns bring it there, else the nearest position.
 
-    What is NaN or infinite is nowhere near, and becomes NaN.
+    NaN and infinite values become NaN.
     """
     known, q, turns = q.isfinite(), reduced(arm, q), revolute(arm)
     outside = torch.maximum(arm.lower - q, q - arm.upper)
@@ -184,11 +184,11 @@ def inside_limits(arm: Arm, q: Tensor) -> Tensor:
 
 
 def _limits(arm: Arm, start: Tensor | None, max_move: float | Tensor | None) -> tuple[Tensor, Tensor]:
-    """Limits of the search, ``(N,)``, or ``(M, N)`` where it is bound to ``start``."""
+    """Limits of the search, ``(N,)``, or ``(M, N)`` if it is bounded around ``start``."""
     if max_move is None:
         return arm.lower, arm.upper
     if start is None:
-        raise InputError("max_move bounds the way from q0: give q0 with it")
+        raise InputError("max_move bounds the distance from q0: give q0 with it")
     move = joint_numbers("max_move", max_move, arm)
     return torch.maximum(arm.lower, start - move), torch.minimum(arm.upper, start + move)
 
@@ -206,7 +206,7 @@ def _spread(count: int, joints: int) -> Tensor:
 
 
 def _range(arm: Arm, lower: Tensor, upper: Tensor) -> tuple[Tensor, Tensor]:
-    """Limits between which starts are spread, finite; more than a turn is the same again."""
+    """Finite limits between which starts are spread, at most a turn apart."""
     has_lower, has_upper = lower.isfinite(), upper.isfinite()
     low = torch.where(has_lower, lower, torch.where(has_upper, upper - 2.0 * math.pi, -math.pi))
     high = torch.where(has_upper, upper, torch.where(has_lower, lower + 2.0 * math.pi, math.pi))
@@ -216,7 +216,7 @@ def _range(arm: Arm, lower: Tensor, upper: Tensor) -> tuple[Tensor, Tensor]:
 
 
 def _middle(arm: Arm) -> Tensor:
-    """The start of who gives none, ``(N,)``."""
+    """The default start, ``(N,)``."""
     low, high = _range(arm, arm.lower, arm.upper)
     return low + (high - low) * _spread(1, arm.num_joints)[0].to(low)
 
@@ -237,11 +237,11 @@ def solve_rows(
     whole = search.constraint == "pose" and search.weights is None
     form = universal(search.arm) if whole else "a part of the pose"
     known = not isinstance(form, str) and (count > 1 or len(rounds) > 1)
-    # A row is done once its last place is filled; where all solutions are known, once it has one.
+    # A row is done once its last slot is filled, or, if all solutions are known, once it has one.
     needed = 0 if known else count - 1
     open_rows = valid.nonzero().squeeze(-1)
     if known and count == 1:
-        # Nothing is nearer than to stay.
+        # Staying is the nearest solution.
         pool.residual[open_rows, 0] = residual_at(search, first[open_rows], open_rows)
         open_rows = open_rows[search.cost(pool.residual[open_rows, 0]) > 1.0]
     for stage in _stages(rounds, known=known):
@@ -252,7 +252,7 @@ def solve_rows(
             rows, tries = _branch_tries(search, form, first, open_rows)
         else:
             rows, tries = open_rows, _start_tries(search, first, open_rows, *stage)
-        # Of several starts that are asked for at once, the nearest solution is wanted and not the first.
+        # With several parallel starts, the nearest solution is wanted, not the first.
         all_tries = count > 1 or stage is None or stage[0] == 0
         _put(search, pool, rows, *descend(search, tries, rows, all_tries=all_tries))
         open_rows = open_rows[search.cost(pool.residual[open_rows, needed]) > 1.0]
@@ -262,7 +262,7 @@ def solve_rows(
 
 
 def _stages(rounds: Sequence[int], *, known: bool) -> list[tuple[int, int] | None]:
-    """The first start and the number of starts of each round; None stands for the solutions of `branches`."""
+    """First start and number of starts of each round; None stands for the solutions of `branches`."""
     stages: list[tuple[int, int] | None] = list(zip(accumulate(rounds, initial=0), rounds, strict=False))
     return [None, *stages] if known else stages
 
@@ -277,7 +277,7 @@ def _start_tries(search: Search, first: Tensor, rows: Tensor, begin: int, number
 
 
 def _branch_tries(search: Search, form: Universal, first: Tensor, rows: Tensor) -> tuple[Tensor, Tensor]:
-    """Those of the rows that have analytic solutions, ``(A,)``, and these, ``(A, S, N)``, some repeated."""
+    """The rows with analytic solutions, ``(A,)``, and the solutions, ``(A, S, N)``, some repeated."""
     poses = tool_turns(search.target[rows], search.symmetry)
     many = rows.repeat_interleave(search.symmetry)
     q, valid = all_branches(form, search.arm, poses.flatten(0, 1), first[many], *search.bounds(many))
@@ -288,13 +288,13 @@ def _branch_tries(search: Search, form: Universal, first: Tensor, rows: Tensor) 
 
 
 def _put(search: Search, pool: _Pool, rows: Tensor, q: Tensor, residual: Tensor) -> None:
-    """Keep in ``pool`` the nearest of what ``rows`` had and of ``q`` (A, S, N) with ``residual`` (A, S, 2)."""
+    """Merge ``q`` (A, S, N) with ``residual`` (A, S, 2) into ``pool``, keeping the nearest of each of ``rows``."""
     start, number = pool.start[rows].unsqueeze(1), pool.q.shape[1]
     lower, upper = (limit.reshape(-1, 1, q.shape[-1]) for limit in search.bounds(rows))
     q = torch.where(pool.turns, turned_towards(q, start, lower, upper), q)
     q, residual = torch.cat([pool.q[rows], q], dim=1), torch.cat([pool.residual[rows], residual], dim=1)
     cost = search.cost(residual)
-    # What is not solved comes after all that is.
+    # Unsolved ones come after all solved ones.
     key = torch.where(cost <= 1.0, travel(q, start, pool.speed), 1e6 * cost)
     picked = first_distinct(q, key, number, pool.turns)
     index = picked.clamp_min(0).unsqueeze(-1)
@@ -307,9 +307,9 @@ def _put(search: Search, pool: _Pool, rows: Tensor, q: Tensor, residual: Tensor)
 
 
 def _as_started(search: Search, pool: _Pool, start: Tensor) -> _Pool:
-    """The pool with endless joints as many turns on as ``start`` (M, N) is from the pool's own start.
+    """The pool with endless joints shifted by the whole turns between ``start`` (M, N) and the pool's own start.
 
-    Turned so far that a solution's rounding would pass the tolerances, it stays as it is.
+    A solution stays unshifted if rounding after so many turns would exceed the tolerances.
     """
     arm = search.arm
     endless = pool.turns & arm.lower.isinf() & arm.upper.isinf()
@@ -326,7 +326,7 @@ def _as_started(search: Search, pool: _Pool, start: Tensor) -> _Pool:
 
 
 def _status(search: Search, pool: _Pool, valid: Tensor) -> Tensor:
-    """Status ``(M, K)`` of what the pool holds."""
+    """Status ``(M, K)`` of the pool's entries."""
     solved = search.cost(pool.residual) <= 1.0
     status = torch.where(solved, int(IKStatus.SOLVED), int(IKStatus.UNREACHED))
     failed = (valid & ~solved[:, 0]).nonzero().squeeze(-1)

@@ -1,22 +1,21 @@
-"""How long joints take to be somewhere, at rest, within limits of speed and acceleration: in closed form."""
+"""Time that joints need to come to rest at a position within speed and acceleration limits, in closed form."""
 
 import torch
 from torch import Tensor
 
 TINY = 1e-12
-"""Below this a square is taken for none: its root would have no derivative."""
+"""Squares below this count as 0, because their root would have no finite derivative."""
 
 
 def travel_time(offset: Tensor, velocity: Tensor, speed: Tensor, acceleration: Tensor) -> Tensor:
     """Least time to stop ``offset`` away; each joint on its own, differentiable [s].
 
-    From where a joint would stop if it braked at once, the way that is left says in which direction it goes: it
-    changes to its peak speed at full acceleration, keeps to the limit if it gets there, and brakes at the end. The
-    peak follows from v² = a·d + u²/2, with way d and present speed u in that direction. Every longer time can be had
-    by a lower peak, so that joints arrive together with the slowest.
+    The distance left after braking at once gives a joint's direction: it accelerates to its peak speed, cruises at the
+    limit if it reaches it, and brakes at the end. The peak follows from v² = a·d + u²/2, with distance d and present
+    speed u in that direction. A lower peak gives any longer time, so joints can arrive together with the slowest.
 
     Args:
-        offset: ``(*B, N)`` way to go [rad; m].
+        offset: ``(*B, N)`` distance to go [rad; m].
         velocity: ``(*B, N)`` now [rad/s; m/s].
         speed: ``(N,)`` limits, positive.
         acceleration: ``(N,)`` limits, positive.
@@ -24,7 +23,7 @@ def travel_time(offset: Tensor, velocity: Tensor, speed: Tensor, acceleration: T
     Returns:
         ``(*B, N)`` [s].
     """
-    # Braking at once, a joint stops this far away.
+    # Distance in which a joint stops if it brakes at once.
     left = offset - velocity * velocity.abs() * (0.5 / acceleration)
     heading = torch.where(left < 0.0, -1.0, 1.0)
     way, now = offset * heading, velocity * heading
@@ -37,5 +36,5 @@ def travel_time(offset: Tensor, velocity: Tensor, speed: Tensor, acceleration: T
 
 
 def arrival_time(offset: Tensor, velocity: Tensor, speed: Tensor, acceleration: Tensor) -> Tensor:
-    """Least time until all joints are there, ``(*B,)`` [s]; arguments as of `travel_time`."""
+    """Least time until all joints have arrived, ``(*B,)`` [s]; for the arguments see `travel_time`."""
     return travel_time(offset, velocity, speed, acceleration).amax(-1)

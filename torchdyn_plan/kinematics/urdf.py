@@ -1,8 +1,8 @@
-"""Joints of an arm out of URDF.
+"""Joints of an arm from URDF.
 
-Of the text only the joints between base and tip are read, and those that they mimic, so that nothing can be wrong that
-an arm does not need: no transmissions, materials, meshes, inertias or plugins, and no joints elsewhere. These joints
-are handed to the parser of pytorch-kinematics; its chains would round their offsets to float32.
+Only the joints between base and tip are read, and those that they mimic, so that errors in parts an arm does not need
+do not matter: transmissions, materials, meshes, inertias, plugins, other joints. These joints are passed to the parser
+of pytorch-kinematics; its chains would round their offsets to float32.
 """
 
 from __future__ import annotations
@@ -48,7 +48,7 @@ def joints_of_urdf(source: Source, *, base: str | None, tip: str) -> list[Joint]
 
 
 def _parsed(source: Source) -> Element:
-    """Root of the XML; names are taken as they stand, so that a prefix need not be declared."""
+    """Root of the XML; names are taken literally, so that prefixes need not be declared."""
     given = file_or_text(source, "URDF")
     builder, parser = ElementTree.TreeBuilder(), expat.ParserCreate()
     parser.StartElementHandler, parser.EndElementHandler = builder.start, builder.end

@@ -84,7 +84,7 @@ class AnalyticForecast(ForecastModel):
         return Forecast(path.to(seen[0].dtype), spread)
 
     def part_settings(self) -> dict[str, Any]:
-        """Arguments that make the same model."""
+        """Constructor arguments of this model."""
         names = ("horizon", "control_step", "tracked", "noise", "acceleration")
         return {name: getattr(self, name) for name in names}
 
@@ -131,7 +131,7 @@ class Ballistic(AnalyticForecast):
         return Forecast(path, normal_spread(deviation.unsqueeze(-1).expand(*deviation.shape, 2)))
 
     def part_settings(self) -> dict[str, Any]:
-        """Arguments that make the same model."""
+        """Constructor arguments of this model."""
         return super().part_settings() | {"gravity": self.gravity}
 
 
@@ -235,7 +235,7 @@ class Billiard(AnalyticForecast):
         return Rolled(heading * along, (whole + 1.0) * met, torch.where(met, share, 1.0), since)
 
     def part_settings(self) -> dict[str, Any]:
-        """Arguments that make the same model."""
+        """Constructor arguments of this model."""
         names = (
             "half_extent",
             "restitution",

@@ -127,7 +127,7 @@ class AnalyticArrival(Precise, ArrivalModel):
         return (seconds * (self.slowdown / self.control_step) + self.extra_steps).clamp_min(0.0)
 
     def part_settings(self) -> dict[str, Any]:
-        """Arguments that make the same model."""
+        """Constructor arguments of this model."""
         limits = {name: tuple(getattr(self, name).tolist()) for name in ("speed", "acceleration")}
         own = {name: getattr(self, name) for name in ("joints", "control_step", "extra_steps", "slowdown")}
         return own | limits

@@ -50,5 +50,5 @@ class ForecastByNoise(ForecastModel):
         return type(self)(self.exact.for_inference(), self.noisy.for_inference(), least_noise=self.least_noise)
 
     def part_settings(self) -> dict[str, Any]:
-        """Arguments that make the same model."""
+        """Constructor arguments of this model."""
         return {name: getattr(self, name) for name in ("exact", "noisy", "least_noise")}

@@ -88,6 +88,6 @@ class PointArrival(ArrivalModel):
         return torch.where((left * heading).sum(-1, keepdim=True) > 0.0, cruising, early)
 
     def part_settings(self) -> dict[str, Any]:
-        """Arguments that make the same model."""
+        """Constructor arguments of this model."""
         names = ("speed", "acceleration", "control_step", "stops", "radius")
         return {name: getattr(self, name) for name in names}

@@ -116,5 +116,5 @@ class SpreadForecaster(ForecastModel):
         return InferenceForecaster(self.forecaster, self.spread)
 
     def part_settings(self) -> dict[str, Any]:
-        """Arguments that make the same model."""
+        """Constructor arguments of this model."""
         return {"forecaster": self.forecaster, "spread": self.spread}

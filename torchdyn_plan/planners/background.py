@@ -1,4 +1,4 @@
-"""Planning beside a control loop in real time: in a thread, with a deadline."""
+"""Planning in a background thread, with a deadline, for control loops in real time."""
 
 from __future__ import annotations
 
@@ -21,33 +21,32 @@ from torchdyn_plan.planners.seconds import steps_in
 
 
 class Order(NamedTuple):
-    """Plans that the thread was asked for."""
+    """A request for plans that was handed to the thread."""
 
     made: Future[Plan]
     rows: Tensor
-    """``(*B,)`` bool: rows that wait for them."""
+    """``(*B,)`` bool: rows that wait for a plan."""
     step_count: Tensor
-    """``(*B,)`` of the step in which they were ordered."""
+    """``(*B,)`` step at which they were ordered."""
 
 
 class Background:
-    """Makes plans in a thread while the control loop continues: a planner's ``delivery``.
+    """Makes plans in a thread while the control loop runs: a planner's ``delivery``.
 
-    A plan comes into use ``latency`` control steps after it was ordered, the moment for which it was made. One that is
-    not ready then comes into use when it is, as old as it is; one that is not ready by the ``deadline`` never does, and
-    the last valid goal is kept. The thread makes one plan at a time. A thread cannot live in a tensordict: this serves
-    one loop only.
+    A plan is used ``latency`` control steps after it was ordered, the step for which it was made. If it is late it is
+    used as soon as it is ready; if it is not ready by the ``deadline`` it is dropped, and the last valid goal is kept.
+    The thread makes one plan at a time. Because a thread cannot be stored in a tensordict, one object serves one loop.
     """
 
     State: ClassVar[type[NoState]] = NoState
 
     def __init__(self, *, latency: int, deadline: int, executor: Executor | None = None) -> None:
-        """Join a thread to a loop.
+        """Set up the thread.
 
         Args:
-            latency: control steps from seeing to acting on it, as `measured_latency` finds them.
-            deadline: control steps, at least ``latency``.
-            executor: runs the jobs one after the other; a new thread by default.
+            latency: control steps from observation to action, see `measured_latency`.
+            deadline: control steps after which a plan is dropped, at least ``latency``.
+            executor: runs one job at a time; a new thread by default.
         """
         check_number("latency", latency, minimum=0, integer=True)
         check_number("deadline", deadline, minimum=latency, integer=True)
@@ -65,11 +64,11 @@ class Background:
         return cls(latency=steps[0], deadline=steps[1], executor=executor)
 
     def close(self) -> None:
-        """Wait for the thread's last plan and end it."""
+        """Wait for the last plan and end the thread."""
         self.executor.shutdown()
 
     def drop(self) -> None:
-        """Discard the plan that is being made: for a loop that restarts, or is evaluated out of order."""
+        """Discard the plan in progress, when the loop restarts or jumps."""
         order, self._order = self._order, None
         if order is not None:
             wait([order.made])
@@ -83,9 +82,9 @@ class Background:
         return state
 
     def arrive(self, plan: Plan, state: NoState, observation: Observation) -> tuple[Plan, Tensor]:
-        """Plans that are ready and meant for now or earlier; raises what the planning raised.
+        """Plans that are ready and due; re-raises an exception from the thread.
 
-        Everywhere is busy while the thread is.
+        All rows are busy while the thread is.
         """
         step_count, order = observation.step_count, self._order
         busy = torch.zeros_like(step_count, dtype=torch.bool)
@@ -107,7 +106,7 @@ class Background:
     ) -> tuple[Plan, NoState]:
         """Hand the work to the thread if any row is due."""
         if due.any():
-            # The loop's world may write into the same memory while the thread reads.
+            # The environment may overwrite the same memory while the thread reads it.
             copy = Observation.of([value.clone() for value in observation.flat()])
             made = self.executor.submit(_make, make, due, copy, plan, torch.is_grad_enabled())
             self._order = Order(made, due, copy.step_count)
@@ -115,19 +114,19 @@ class Background:
 
 
 def _make(make: MakePlans, due: Tensor, observation: Observation, plan: Plan, gradients: bool) -> Plan:
-    """The plans; whether gradients are wanted is known to each thread alone."""
+    """The plans; torch's gradient mode is thread-local, so it is passed in."""
     with torch.set_grad_enabled(gradients):
         return make(due, observation, plan, plan)
 
 
 def measured_latency(plan: Callable[[], object], control_step: float, *, runs: int = 20, quantile: float = 0.95) -> int:
-    """Control steps that ``plan`` takes on this machine, rounded up, by the given quantile of ``runs`` calls.
+    """Control steps that ``plan`` takes on this machine: a quantile of ``runs`` timed calls, rounded up.
 
     Args:
         plan: makes one plan.
         control_step: length of a control step [s].
-        runs: calls that are timed, after one that is not.
-        quantile: 0 … 1.
+        runs: timed calls, after one warm-up call.
+        quantile: of the times, 0 … 1.
     """
     check_number("control_step", control_step, minimum=1e-9)
     check_number("runs", runs, minimum=1, integer=True)

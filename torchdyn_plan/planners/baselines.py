@@ -1,4 +1,4 @@
-"""What a planner for a moving target is measured against: two extremes, and one that knows the future."""
+"""Baselines for a planner of a moving target: two extremes, and one that knows the future."""
 
 from __future__ import annotations
 
@@ -29,8 +29,8 @@ class TargetPursuit(Remembering):
         """Build on ``static``, a planner for a static goal.
 
         Args:
-            static: as above.
-            turn: how the tool is to be turned, for a static planner that reads ``goal_pose``.
+            static: see above.
+            turn: orientation of the tool, for a static planner that reads ``goal_pose``.
             scene: digest of its scene; None if it has none.
         """
         super().__init__()
@@ -40,9 +40,9 @@ class TargetPursuit(Remembering):
         self.out_keys = keys_written(self.static, *goals, keys.ARRIVAL_STEPS)
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
-        """Write ``goal`` (*B, D) [m, world] and ``arrival_steps`` (*B,), which is 0, and act.
+        """Write ``goal`` (*B, D) [m, world], ``arrival_steps`` (*B,) of 0, and ``action``.
 
-        Rows in which an input is NaN or infinite get action 0.
+        Rows with a NaN or infinite input get action 0.
         """
         target_pos = read(tensordict, keys.TARGET_POS, "TargetPursuit")
         check_points(keys.TARGET_POS, target_pos)
@@ -59,7 +59,7 @@ class TargetPursuit(Remembering):
         return self.static(tensordict) if bad is None else act(self.static, tensordict, bad)
 
     def empty_memory(self, like: Tensor) -> dict[str, Tensor]:
-        """The static planner's, as `Remembering` says."""
+        """The static planner's memory, see `Remembering`."""
         return self.static.empty_memory(like) if isinstance(self.static, Remembering) else {}
 
 
@@ -70,7 +70,7 @@ class EndOfForecast:
     def __call__(
         self, forecast: Forecast, target_pos: Tensor, eta: ArrivalQuery, context: SearchContext = NO_CONTEXT
     ) -> Meeting:
-        """The end of the forecast, in F steps; ``eta`` is asked once whether the robot can reach it."""
+        """The end of the forecast, in F steps; one query of ``eta`` tells whether the robot can reach it."""
         goal = forecast.path[..., -1, :]
         never = eta(goal.unsqueeze(-2)).never.squeeze(-1)
         steps = torch.full_like(never, forecast.path.shape[-2], dtype=torch.int64)
@@ -80,19 +80,19 @@ class EndOfForecast:
 class RecordedFuture(ForecastModel):
     """A forecaster that returns the true future, from a recording of the same episode.
 
-    Entry k of ``target_future`` is where the target was at step k of the episode, with the arm held still.
+    Entry k of ``target_future`` is the target's position at step k of the episode, recorded with the arm at rest.
     """
 
     in_keys = (keys.TARGET_FUTURE, keys.STEP_COUNT)
 
     def __init__(self, horizon: int = 300) -> None:
-        """Tell ``horizon`` control steps; the target stays where its recording ends."""
+        """Forecast ``horizon`` control steps; after the end of the recording the target stays in place."""
         super().__init__()
         check_number("horizon", horizon, minimum=1, integer=True)
         self.horizon = horizon
 
     def predict(self, *seen: Tensor) -> Forecast:
-        """Positions at steps t+1 … t+F, ``(*B, F, D)``, of recordings ``(*B, T, D)`` at steps t (*B,) [m, world]."""
+        """Positions at steps t+1 … t+F, ``(*B, F, D)``, from recordings ``(*B, T, D)`` and steps t (*B,) [m, world]."""
         target_future, step_count = seen
         check_points(keys.TARGET_FUTURE, target_future, _length(target_future))
         check_finite(keys.TARGET_FUTURE, target_future)
@@ -102,21 +102,21 @@ class RecordedFuture(ForecastModel):
         return Forecast(target_future.gather(-2, index.unsqueeze(-1).expand(*index.shape, target_future.shape[-1])))
 
     def part_settings(self) -> dict[str, Any]:
-        """Arguments that make the same model."""
+        """Constructor arguments of this model."""
         return {"horizon": self.horizon}
 
 
 class TrueFuture(ForecastModel):
-    """Stands in for a forecaster and tells the truth, whatever has happened: ``true_future``, as long as it is shown.
+    """A forecaster that returns the true future ``true_future``, even after contact with the robot.
 
-    An evaluation simulates it from the present state, the robot held still, wherever the target has left what was
-    simulated before.
+    An evaluation simulates it from the present state with the robot at rest, again whenever the target has left what
+    was simulated before.
     """
 
     in_keys = (keys.TRUE_FUTURE,)
 
     def predict(self, *seen: Tensor) -> Forecast:
-        """Positions at steps t+1 … t+F, ``(*B, F, D)`` [m, world], as they are shown."""
+        """Positions at steps t+1 … t+F, ``(*B, F, D)`` [m, world], as given."""
         (true_future,) = seen
         check_points(keys.TRUE_FUTURE, true_future, _length(true_future))
         check_finite(keys.TRUE_FUTURE, true_future)
@@ -128,26 +128,27 @@ class TrueFuture(ForecastModel):
 
 
 def _length(path: Tensor) -> int:
-    """Places of ``path`` (*B, T, D), at least one."""
+    """Number of positions in ``path`` (*B, T, D), at least one."""
     return path.shape[-2] if path.ndim > 1 else 1
 
 
 def oracle_trajectory(
     static: StaticPlanner, eta: Any, *, horizon: int = 300, recorded: bool = True, **parts: Any
 ) -> DynamicPlanner:
-    """The paper's planner with the truth as its forecast (paper, IV-A.2).
+    """The paper's planner with the true future as its forecast (paper, IV-A.2).
 
     Args:
-        static: as of `DynamicPlanner`, like ``eta`` and ``parts``.
-        eta: predicts how long ``static`` needs to a goal.
-        horizon: as far as its search may look into a recording [control steps].
-        recorded: the truth is what was recorded before the episode with the robot at its start, ``target_future``
-            (*B, T, D), and no longer true once the target was touched; else ``true_future`` (*B, F, D), which is.
-        **parts: as of `DynamicPlanner`.
+        static: see `DynamicPlanner`.
+        eta: predicts the time that ``static`` needs to a goal.
+        horizon: how far its search looks into the future [control steps].
+        recorded: whether the future is ``target_future`` (*B, T, D), recorded before the episode with the robot at its
+            start, which is wrong once the robot touches the target; else it is ``true_future`` (*B, F, D), which stays
+            right.
+        **parts: see `DynamicPlanner`.
     """
     return DynamicPlanner.paper(static, RecordedFuture(horizon) if recorded else TrueFuture(), eta, **parts)
 
 
 def wait_at_end(static: StaticPlanner, forecaster: Any, eta: Any, **parts: Any) -> DynamicPlanner:
-    """Goes to where the forecast ends and waits there: the other extreme beside pursuit (paper, III-B.4)."""
+    """Goes to the end of the forecast and waits there: the opposite extreme to pursuit (paper, III-B.4)."""
     return DynamicPlanner.paper(static, forecaster, eta, **{"search": EndOfForecast(), **parts})

@@ -1,4 +1,4 @@
-"""Several targets, and one robot: which of them is met next."""
+"""Several targets and one robot: which target to meet next."""
 
 from __future__ import annotations
 
@@ -20,18 +20,18 @@ from torchdyn_plan.planners.protocol import keys_written, read
 from torchdyn_plan.planners.rows import apply_to_rows, where_rows
 
 NONE = -1
-"""Number of the target of a row that has none."""
+"""Slot of a row without a target."""
 OUT_OF_REACH = 1e6
-"""Control steps that a target counts as later that cannot be met on its forecast."""
+"""Control steps added to a target that cannot be met on its forecast."""
 
 
 class Choice(NamedTuple):
-    """Which target each row is after."""
+    """The target that each row pursues."""
 
     choice_target: Tensor
-    """``(*B,)`` int64 its slot, -1 for none."""
+    """``(*B,)`` int64 slot of the target, -1 for none."""
     choice_age: Tensor
-    """``(*B,)`` int64 control steps since it was last compared with others."""
+    """``(*B,)`` int64 control steps since it was last compared with the others."""
 
 
 NAMES = Choice._fields
@@ -40,38 +40,38 @@ NAMES = Choice._fields
 
 @runtime_checkable
 class Commits(Protocol):
-    """A maneuver that is not to be sent to another target in its midst; `MatchVelocity` is one."""
+    """A maneuver that must not switch targets while it runs, such as `MatchVelocity`."""
 
     def committed(self, state: Any, /) -> Tensor:
-        """``(*B,)`` bool by its state: rows that keep their target."""
+        """``(*B,)`` bool: rows that must keep their target."""
         ...
 
     def finished(self, state: Any, /) -> Tensor:
-        """``(*B,)`` bool by its state: rows that are done with their target, and begin anew."""
+        """``(*B,)`` bool: rows that are done with their target and start over."""
         ...
 
 
 class ChoosingPlanner(PretrainedPlanner, Remembering):
-    """Lets a `DynamicPlanner` meet one target after the other, of up to K in each row.
+    """Lets a `DynamicPlanner` meet one target after another, out of up to K in each row.
 
-    Reads ``targets_present`` (*B, K) bool, ``targets_pos`` (*B, K, D), and of all targets what the planner reads of
-    one (`torchdyn_plan.keys.OF_ALL_TARGETS`). Every few steps it plans a meeting with each target: all forecasts are
-    one pass of the forecaster, all arrivals one pass of the arrival model. The target that can be met soonest is
-    chosen; where ``targets_value`` (*B, K) is given, the most valuable of those that can be met, and of equals the one
-    that is met soonest. The planner sees this target alone, and starts afresh when it becomes another one; entries of
-    the tensordict stay as they were. A row without any target holds still, with `PlanStatus.TARGET_LOST`. A maneuver
-    that `Commits` keeps its target until it has finished.
+    Reads ``targets_present`` (*B, K) bool, ``targets_pos`` (*B, K, D) and, for all targets, what the planner reads for
+    one (`torchdyn_plan.keys.OF_ALL_TARGETS`). Every few steps it plans a meeting with each target, with one forward
+    pass of the forecaster and one of the arrival model. It chooses the target that can be met soonest; if
+    ``targets_value`` (*B, K) is given, the most valuable of the targets that can be met, ties going to the soonest. The
+    planner sees the chosen target only, and restarts when the target changes; the tensordict's own entries are left
+    unchanged. A row without targets holds still, with `PlanStatus.TARGET_LOST`. A maneuver that `Commits` keeps its
+    target until it has finished.
 
-    ``plan.choice_target`` tells the slot of each row's target, -1 for none.
+    ``plan.choice_target`` holds the slot of each row's target, -1 for none.
     """
 
     def __init__(self, planner: DynamicPlanner, *, every: int = 10, sooner: float = 25.0) -> None:
         """Choose for ``planner``.
 
         Args:
-            planner: made of parts that see one target.
-            every: control steps from one comparison of the targets to the next.
-            sooner: control steps by which another target must be met sooner to take the place of the one chosen.
+            planner: a planner for one target.
+            every: control steps between comparisons of the targets.
+            sooner: another target replaces the chosen one only if it can be met this many control steps sooner.
         """
         super().__init__()
         if not isinstance(planner, DynamicPlanner):
@@ -82,7 +82,9 @@ class ChoosingPlanner(PretrainedPlanner, Remembering):
         read_of_one = (keys.TARGET_POS, *planner.forecaster.in_keys, *planner.read_by_turn)
         unknown = [key for key in read_of_one if key not in keys.OF_ALL_TARGETS]
         if unknown:
-            raise InputError(f"the planner reads {', '.join(map(str, unknown))}, which is known of one target alone")
+            raise InputError(
+                f"the planner reads {', '.join(map(str, unknown))}, which is not available for several targets"
+            )
         self.of_one = tuple(dict.fromkeys(read_of_one))
         self.of_all = tuple(keys.OF_ALL_TARGETS[key] for key in self.of_one)
         own: list[Any] = [(keys.PLAN, name) for name in NAMES]
@@ -97,7 +99,7 @@ class ChoosingPlanner(PretrainedPlanner, Remembering):
         return self.planner.scene
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
-        """Choose where that is due, and let the planner act on what is chosen."""
+        """Choose a target in the rows that are due, and run the planner on it."""
         present = read(tensordict, keys.TARGETS_PRESENT, "ChoosingPlanner").bool()
         step_count = read(tensordict, keys.STEP_COUNT, "ChoosingPlanner").reshape(present.shape[:-1])
         for key in self.of_all:
@@ -107,7 +109,7 @@ class ChoosingPlanner(PretrainedPlanner, Remembering):
         chosen = before.choice_target
         there = (chosen >= 0) & present.gather(-1, chosen.clamp_min(0).unsqueeze(-1)).squeeze(-1)
         due = ~committed & (finished | ~there | (before.choice_age >= self.every))
-        # A target that is the only one needs no comparison.
+        # A single target needs no comparison.
         several = present.sum(-1) > 1
         only = torch.where(present.any(-1), present.long().argmax(-1), NONE)
         chosen_yet = torch.where(finished | ~there, NONE, chosen)
@@ -116,7 +118,7 @@ class ChoosingPlanner(PretrainedPlanner, Remembering):
         anew = (target != chosen) | finished
         self._act(tensordict, target, anew, step_count)
         age = torch.where(due, 0, before.choice_age) + 1
-        # At its first step a row has not seen its targets move: it compares them again at the next.
+        # At its first step a row has not seen its targets move yet, so it compares them again at the next.
         age = torch.where(step_count == 0, self.every, age)
         status = tensordict.get((keys.PLAN, "status"))
         status = status.masked_fill(target < 0, int(PlanStatus.TARGET_LOST))
@@ -124,34 +126,34 @@ class ChoosingPlanner(PretrainedPlanner, Remembering):
         return tensordict
 
     def values(self, observation: Observation) -> Tensor:
-        """Control steps ``(*B,)`` until a target can be met, many more where it cannot be; one pass of each model.
+        """Control steps ``(*B,)`` until a target can be met, plus `OUT_OF_REACH` if it cannot; one pass of each model.
 
-        ``observation`` is of one target in each row, whose batch may be (*B, K).
+        ``observation`` has one target in each row; its batch may be (*B, K).
         """
         plan = self.planner.replan(observation, Plan.hold(observation, 0, turned=self.planner.turn is not None))
         late = OUT_OF_REACH * (~plan.reachable | ~plan.usable)
         return plan.arrival_steps.to(observation.tool_pos.dtype) + late
 
     def empty_memory(self, like: Tensor) -> dict[str, Tensor]:
-        """The choice, and the planner's, as `Remembering` says."""
+        """The memory of the choice and of the planner, see `Remembering`."""
         return dict(zip(NAMES, self._none(like[..., 0]), strict=True)) | self.planner.empty_memory(like)
 
     def part_settings(self) -> dict[str, Any]:
-        """Arguments that make the same planner."""
+        """Constructor arguments of this planner."""
         return {name: getattr(self, name) for name in ("planner", "every", "sooner")}
 
     def for_inference(self) -> ChoosingPlanner:
-        """The same on copies of the planner's networks as they are now, in as few operations as possible."""
+        """A copy with the planner's current networks prepared for inference, in as few operations as possible."""
         settings: dict[str, Any] = self.part_settings() | {"planner": self.planner.for_inference()}
         return type(self)(**settings).train(self.training)
 
     def _none(self, like: Tensor) -> Choice:
-        """No target, and one to be chosen at once, in rows ``like`` (*B,)."""
+        """No target, with a choice due at once, for rows ``like`` (*B,)."""
         nothing = torch.full(like.shape, NONE, dtype=torch.int64, device=like.device)
         return Choice(nothing, torch.full_like(nothing, self.every))
 
     def _recall(self, tensordict: TensorDictBase, step_count: Tensor) -> tuple[Choice, Tensor, Tensor]:
-        """The choice of the step before, and rows ``(*B,)`` whose maneuver has finished, or is in its midst."""
+        """The choice of the last step, and the rows ``(*B,)`` whose maneuver has finished, and that are committed."""
         start, plan = self._none(step_count), tensordict.get(keys.PLAN, None)
         stored: dict[str, Any] = {} if plan is None else dict(plan.items())
         no = torch.zeros_like(step_count, dtype=torch.bool)
@@ -168,7 +170,7 @@ class ChoosingPlanner(PretrainedPlanner, Remembering):
         return choice, maneuver.finished(state) & ~fresh, maneuver.committed(state) & ~fresh
 
     def _choose(self, tensordict: TensorDictBase, present: Tensor, due: Tensor, chosen: Tensor) -> Tensor:
-        """Slots ``(*B,)`` of the targets: compared in the rows ``due``, those ``chosen`` in the others."""
+        """Slots ``(*B,)`` of the targets: newly chosen in the rows ``due``, ``chosen`` in the others."""
         value = tensordict.get(keys.TARGETS_VALUE, None)
         value = torch.zeros(present.shape, device=present.device) if value is None else value
         robot = [read(tensordict, key, "ChoosingPlanner") for key in (keys.TOOL_POS, keys.ROBOT_STATE)]
@@ -181,7 +183,7 @@ class ChoosingPlanner(PretrainedPlanner, Remembering):
             tool_pos, robot_state, steps, there, worth, now, *seen = rows
             count = there.shape[-1]
             each = [one.unsqueeze(1).expand(len(one), count, *one.shape[1:]) for one in (tool_pos, robot_state, steps)]
-            # What is in an empty slot is no matter, and may be no number.
+            # The content of an empty slot does not matter, and may be NaN.
             seen = [torch.nan_to_num(one) for one in seen]
             position = seen[names.index(keys.TARGET_POS)]
             read_of_one = tuple(seen[names.index(key)] for key in wanted)
@@ -198,7 +200,7 @@ class ChoosingPlanner(PretrainedPlanner, Remembering):
         return apply_to_rows(compare, due, inputs, (chosen,), chunk=self.planner.chunk)[0]
 
     def _act(self, tensordict: TensorDictBase, target: Tensor, anew: Tensor, step_count: Tensor) -> None:
-        """Let the planner act on the targets in slots ``target`` (*B,), from its first step on in the rows ``anew``."""
+        """Run the planner on the targets in slots ``target`` (*B,); it restarts in the rows ``anew``."""
         shown: dict[Any, Tensor] = {}
         for one, of_all in zip(self.of_one, self.of_all, strict=True):
             value = tensordict.get(of_all)

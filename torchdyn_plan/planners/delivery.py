@@ -1,4 +1,4 @@
-"""Planning takes time: when plans become available. A planner without a delivery uses them at once."""
+"""When plans become available, given that planning takes time. Without a delivery, plans are used at once."""
 
 from __future__ import annotations
 
@@ -16,19 +16,19 @@ from torchdyn_plan.planners.rows import any_row, where_rows
 from torchdyn_plan.planners.seconds import steps_in
 
 MakePlans = Callable[[Tensor, Observation, Plan, Plan], Plan]
-"""Makes new plans in the rows of a mask ``(*B,)``, from the observation and the plan in use; the other rows are those
-of the last argument."""
+"""Makes new plans in the rows of a mask ``(*B,)``, from the observation and the plan in use; the other rows are taken
+from the last argument."""
 
 
 class Delivery(Protocol):
-    """When plans become available; what it remembers from step to step is its ``State``."""
+    """Decides when plans become available; its memory from step to step is a ``State``."""
 
     State: ClassVar[type[Any]]
     """A `NamedTuple` of tensors ``(*B, …)``."""
 
     @property
     def delay(self) -> int:
-        """Control steps for which a planner plans ahead, to the moment at which the plan becomes available."""
+        """Control steps that a planner plans ahead, to the step at which the plan becomes available."""
         ...
 
     def start(self, plan: Plan, /) -> Any:
@@ -52,10 +52,10 @@ class Delivery(Protocol):
     def order(
         self, make: MakePlans, due: Tensor, observation: Observation, plan: Plan, state: Any, /
     ) -> tuple[Plan, Any]:
-        """Begin plans in the rows ``due`` (*B,); the plans in use stay.
+        """Start plans in the rows ``due`` (*B,); the plans in use stay.
 
         Returns:
-            The plans that were made, as far as they are known (else those in use), and the next state.
+            The new plans, or the plan in use where they are not ready yet, and the next state.
         """
         ...
 
@@ -81,12 +81,12 @@ class Pending(NamedTuple):
 
 @dataclass(frozen=True)
 class Delayed:
-    """A plan takes effect some control steps after it was begun, and until then no other is begun in its row."""
+    """A plan takes effect some control steps after it was started; until then no other starts in its row."""
 
     steps: int
-    """Control steps from what a plan was made from to its use."""
+    """Control steps from the observation to the use of the plan made from it."""
     compensate: bool = True
-    """The planner plans for the moment of use; otherwise it takes what comes late for new."""
+    """Whether the planner plans for the step of use; otherwise it ignores the delay."""
 
     State: ClassVar[type[Pending]] = Pending
 
@@ -95,12 +95,12 @@ class Delayed:
 
     @classmethod
     def by_seconds(cls, latency: float, *, control_step: float, compensate: bool = True) -> Delayed:
-        """Plans that take effect ``latency`` [s] after they were begun, in control steps of ``control_step`` [s]."""
+        """Plans that take effect ``latency`` [s] after they were started, in control steps of ``control_step`` [s]."""
         return cls(steps_in("latency", latency, control_step), compensate)
 
     @property
     def delay(self) -> int:
-        """Control steps for which the planner plans ahead."""
+        """Control steps that the planner plans ahead."""
         return self.steps if self.compensate else 0
 
     def start(self, plan: Plan) -> Pending:
@@ -108,11 +108,11 @@ class Delayed:
         return Pending(*plan, steps=torch.full_like(plan.age, -1))
 
     def older(self, state: Pending) -> Pending:
-        """One step nearer."""
+        """The state one control step later."""
         return state._replace(steps=state.steps - 1)
 
     def arrive(self, plan: Plan, state: Pending, observation: Observation) -> tuple[Plan, Tensor]:
-        """Those that are due to arrive now."""
+        """Plans that become available now."""
         now = state.steps == 0
         if any_row(now):
             plan = Plan(*(where_rows(now, new, old) for new, old in zip(state.plan, plan, strict=True)))
@@ -121,7 +121,7 @@ class Delayed:
     def order(
         self, make: MakePlans, due: Tensor, observation: Observation, plan: Plan, state: Pending
     ) -> tuple[Plan, Pending]:
-        """Plan, and let it wait."""
+        """Make plans, and hold them back."""
         made = make(due, observation, plan, state.plan)
         steps = state.steps.clamp_min(0).masked_fill(due, self.steps)
         return made, Pending(*made, steps=steps)

@@ -1,4 +1,4 @@
-"""What is wrong with a tensordict that a planner could not work with: one sentence that names the entry."""
+"""Explains why a planner could not use a tensordict, in one sentence that names the entry."""
 
 from __future__ import annotations
 
@@ -14,13 +14,13 @@ from torchdyn_plan.checks import POINT_SIZES
 from torchdyn_plan.errors import InputError, TorchdynPlanError
 
 COUNTS = (keys.STEP_COUNT, keys.HISTORY_LENGTH, keys.EPISODE, keys.TARGETS_PRESENT)
-"""Keys that hold whole numbers, or whether something is so."""
+"""Keys of integers or booleans."""
 
 
 def explain(error: Exception, planner: Any, tensordict: Any) -> InputError | None:
-    """What is wrong with the ``tensordict`` on which a ``planner`` failed with ``error``; None if it is not that."""
+    """What is wrong with the ``tensordict`` on which a ``planner`` failed with ``error``; None if nothing is."""
     fault = find_fault(tensordict, planner.in_keys, type(planner).__name__) or find_memory_fault(tensordict, planner)
-    # An error of our own that names the entry says more of it.
+    # An error of our own that names the entry is more specific.
     named = isinstance(error, TorchdynPlanError) and fault is not None and fault.name in str(error)
     return None if fault is None or named else InputError(fault.sentence)
 
@@ -60,9 +60,9 @@ def find_fault(tensordict: Any, read: Sequence[Any], reader: str) -> Fault | Non
 
 
 def find_memory_fault(tensordict: TensorDictBase, planner: Any) -> Fault | None:
-    """Why ``planner`` cannot go on from what lies below ``plan`` in ``tensordict``; None if it can."""
+    """Why ``planner`` cannot continue from the memory under ``plan`` in ``tensordict``; None if it can."""
     plan, batch = tensordict.get(keys.PLAN, None), tuple(tensordict.batch_size)
-    remedy = "leave what a planner has written there as it is, or take all of it away"
+    remedy = "leave what the planner wrote there unchanged, or remove all of it"
     if plan is None:
         return None
     if not isinstance(plan, TensorDictBase):
@@ -80,7 +80,7 @@ def find_memory_fault(tensordict: TensorDictBase, planner: Any) -> Fault | None:
 
 
 def _coordinates(tensordict: TensorDictBase) -> int:
-    """Coordinates of the points in ``tensordict``, by the tool's or the target's place; 3 if neither tells."""
+    """Coordinates of positions in ``tensordict``, from the tool or the target; 3 if it has neither."""
     for key in (keys.TOOL_POS, keys.TARGET_POS):
         value = tensordict.get(key, None)
         if isinstance(value, Tensor) and value.ndim and value.shape[-1] in POINT_SIZES:
@@ -89,7 +89,7 @@ def _coordinates(tensordict: TensorDictBase) -> int:
 
 
 def _kind(value: Any) -> str:
-    """What ``value`` is, in a few words."""
+    """A short description of ``value``."""
     if not isinstance(value, Tensor):
         return type(value).__name__
     where = "on no device, " if value.is_meta else ""
@@ -105,7 +105,7 @@ def _number_kind(value: Tensor) -> str:
 
 
 def _fits(shape: tuple[int, ...], batch: tuple[int, ...], expected: tuple[str | int, ...]) -> bool:
-    """Whether ``shape`` is ``batch`` and then ``expected``, of which letters stand for any size."""
+    """Whether ``shape`` is ``batch`` followed by ``expected``, where letters stand for any size."""
     trailing = shape[len(batch) :]
     if shape[: len(batch)] != batch:
         return False

@@ -1,4 +1,4 @@
-"""Which rows of what a planner reads are of use: judged in one place, at a step at which something is wrong."""
+"""Checks a planner's input row by row, at steps at which some value is bad."""
 
 from __future__ import annotations
 
@@ -15,38 +15,37 @@ from torchdyn_plan.checks import hides_values
 from torchdyn_plan.planners.observation import Observation
 
 LARGEST = 1e6
-"""Nothing that robots and targets measure is larger, in its units [m, rad, s]."""
+"""A value above this is bad, in its units [m, rad, s]."""
 
 
 class Judgement(NamedTuple):
-    """Rows with an entry that is NaN, infinite or too large; None if every row is good."""
+    """Rows with a value that is NaN, infinite or too large; None if every row is good."""
 
     blind: Tensor | None = None
     """``(*B,)`` bool: the robot state, or the memory of its static planner, is bad."""
     bad_input: Tensor | None = None
-    """``(*B,)`` bool: an entry of the robot or of the target is bad."""
+    """``(*B,)`` bool: a value of the robot or of the target is bad."""
     spoiled: Tensor | None = None
-    """``(*B,)`` bool: what the planner remembers is bad."""
+    """``(*B,)`` bool: the planner's memory is bad."""
 
 
 GOOD = Judgement()
-"""Of a step in which every row is good."""
+"""The judgement of a step in which every row is good."""
 
 
 def judge(
     observation: Observation, tensordict: TensorDictBase, read_by_static: Sequence[Any], remembered: Sequence[str]
 ) -> tuple[Observation, Judgement]:
-    """Judge everything that a planner reads.
+    """Check everything that a planner reads.
 
     Args:
-        observation: what it sees.
-        tensordict: of which it is.
-        read_by_static: keys that its static planner reads beside; those that are absent do not count.
-        remembered: names below ``plan`` that it remembers.
+        observation: the planner's observation.
+        tensordict: the tensordict it was read from.
+        read_by_static: further keys that the static planner reads; absent ones are skipped.
+        remembered: names of the planner's memory under ``plan``.
 
     Returns:
-        The observation with zeros for all that is bad, so that what is computed of these rows is a number, and the
-        judgement.
+        The observation with zeros in bad rows, so that computing with them stays finite, and the judgement.
     """
     target = [observation.target_pos, *observation.seen]
     plan = _stored(tensordict)
@@ -64,12 +63,12 @@ def judge(
 
 
 def judge_rows(tensordict: TensorDictBase, read: Sequence[Any], batch: torch.Size) -> Tensor:
-    """As `bad_rows`, of the entries ``read`` that are there."""
+    """`bad_rows` for the keys ``read``; absent ones are skipped."""
     return bad_rows(_present(tensordict, _stored(tensordict), read), batch)
 
 
 def bad_rows(values: Sequence[Tensor], batch: torch.Size) -> Tensor:
-    """Rows ``(*B,)`` bool in which some of ``values`` (*B, …) is NaN, infinite, or too large to be a measurement."""
+    """Rows ``(*B,)`` bool in which some of ``values`` (*B, …) is NaN, infinite or above `LARGEST`."""
     bad = torch.zeros(batch, dtype=torch.bool)
     for value in values:
         if value.is_floating_point():
@@ -79,9 +78,9 @@ def bad_rows(values: Sequence[Tensor], batch: torch.Size) -> Tensor:
 
 
 def act(static: Any, tensordict: TensorDictBase, blind: Tensor) -> TensorDictBase:
-    """Let the ``static`` planner act; rows that are ``blind`` (*B,) get action 0, whatever it makes of them.
+    """Run the ``static`` planner; rows that are ``blind`` (*B,) get action 0.
 
-    It is shown zeros there, in a copy: what was read stays as it was. A NaN or infinite goal of theirs is 0, too.
+    It sees zeros there, in a copy, so its inputs stay unchanged. Goals that are NaN or infinite become 0.
     """
     goal = tensordict.get(keys.GOAL)
     tensordict.set(keys.GOAL, _zero(goal, bad_rows([goal], goal.shape[:-1])))
@@ -96,19 +95,19 @@ def act(static: Any, tensordict: TensorDictBase, blind: Tensor) -> TensorDictBas
 
 
 def _stored(tensordict: TensorDictBase) -> dict[str, Any]:
-    """What is stored below ``plan``, as a plain dictionary: a nested look-up takes as long as an operation."""
+    """The entries under ``plan`` as a plain dictionary: a nested look-up costs as much as a tensor operation."""
     plan = tensordict.get(keys.PLAN, None)
     return {} if plan is None else dict(plan.items())
 
 
 def _present(tensordict: TensorDictBase, plan: dict[str, Any], read: Sequence[Any]) -> list[Tensor]:
-    """The entries ``read`` of a tensordict with ``plan`` in it, without those that are absent."""
+    """The values of the keys ``read`` of a tensordict with ``plan`` in it; absent ones are skipped."""
     found = (tensordict.get(key, None) if isinstance(key, str) else plan.get(key[-1]) for key in read)
     return [value for value in found if value is not None]
 
 
 def _zero(value: Tensor, rows: Tensor) -> Tensor:
-    """``value`` (*B, …), but 0 in ``rows`` (*B,)."""
+    """``value`` (*B, …) with 0 in ``rows`` (*B,)."""
     if not value.is_floating_point() or not (hides_values(rows) or debug_unwrap(rows).any()):
         return value
     return value.masked_fill(rows[(..., *[None] * (value.ndim - rows.ndim))], 0.0)

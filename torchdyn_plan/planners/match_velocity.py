@@ -1,4 +1,4 @@
-"""A maneuver that touches a moving target without a jolt: where it is, and as fast as it is."""
+"""A maneuver that reaches a moving target at the target's own velocity, so that contact is smooth."""
 
 from __future__ import annotations
 
@@ -18,68 +18,69 @@ from torchdyn_plan.planners.search.exact import ExactSearch
 
 
 class MatchPhase(IntEnum):
-    """What `MatchVelocity` is about, as `MatchVelocity.phase` tells."""
+    """Phases of `MatchVelocity`, see `MatchVelocity.phase`."""
 
     HOVER = 0
-    """It waits above the meeting place, or is on the way there."""
+    """Waiting above the meeting place, or on the way there."""
     DOWN = 1
-    """It takes on the target's velocity and comes down."""
+    """Matching the target's velocity and descending."""
     HOLD = 2
-    """It is on the target and goes with it: the time for a gripper to close."""
+    """On the target and moving with it: the time for a gripper to close."""
     LIFT = 3
-    """It rises, comes to rest, and stays there until its row starts afresh."""
+    """Rising, coming to rest, and staying there until the row restarts."""
 
 
 class MatchState(NamedTuple):
-    """Where each row stands."""
+    """Progress of each row."""
 
     match_step: Tensor
-    """``(*B,)`` int64 control steps since it began to come down, -1 before."""
+    """``(*B,)`` int64 control steps since the descent began, -1 before."""
     match_from: Tensor
-    """``(*B, D)`` where the tool came down from, or rises from [m, world]."""
+    """``(*B, D)`` where the descent, or the lift, began [m, world]."""
     match_velocity: Tensor
-    """``(*B, D)`` with which it rises [m per control step]."""
+    """``(*B, D)`` velocity at the start of the lift [m per control step]."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class MatchVelocity:
-    """Hovers above the meeting place, comes down with the target's velocity, holds, and lifts.
+    """Hovers above the meeting place, descends while matching the target's velocity, holds, and lifts.
 
-    ``descent_steps`` = n before the meeting, the tool begins to follow the target's path p from where it is, x_0:
+    ``descent_steps`` = n steps before the meeting, the goal starts to blend from the tool's position x_0 into the
+    target's path p:
 
         x(k) = x_0 + w(k) (p(k) - x_0),  w(k) = 10 s³ - 15 s⁴ + 6 s⁵,
 
-    along the ``axis`` with another s than across it, so that it flies along with the target before it comes down. As w
-    is 1 and its derivatives are 0 at the end, x(n) = p(n) and x'(n) = p'(n). Then it follows the path for
-    ``hold_steps``, and rises while it slows down. All of it is said through the goal.
+    where s along the ``axis`` differs from s across it, so that the tool flies along with the target before it
+    descends. As w = 1 with zero derivatives at the end, x(n) = p(n) and x'(n) = p'(n). The goal then follows the path
+    for ``hold_steps``, and rises while it slows down. The static planner is commanded through the goal only.
 
-    The plan's goal is where it waits, and its time that of the contact: `search` makes a search that finds such plans.
-    `MatchPhase` is what ``phase`` makes of ``plan.match_step``: a gripper closes in `MatchPhase.HOLD`.
+    The plan's goal is the hover position and its arrival time the time of contact; ``search`` makes a search for such
+    plans. ``phase`` maps ``plan.match_step`` to a `MatchPhase`: a gripper closes in `MatchPhase.HOLD`.
     """
 
     hover: float
-    """How far from the target it waits, along the axis, by its `search` [m]."""
+    """Hover distance from the target along the axis, used by ``search`` [m]."""
     descent_steps: int
-    """Control steps from when it begins to follow the target to the contact."""
+    """Control steps from the start of the descent to contact."""
     hold_steps: int = 0
-    """Control steps for which it stays on the target."""
+    """Control steps spent on the target."""
     lift: float | None = None
-    """How far it rises after that, along the axis; as far as it hovers for None [m]."""
+    """How far it then rises along the axis; ``hover`` for None [m]."""
     lift_steps: int | None = None
-    """Control steps in which it rises and comes to rest; ``descent_steps`` for None."""
+    """Control steps of the lift, until it is at rest; ``descent_steps`` for None."""
     early_steps: int = 0
-    """It hovers above where the target is so many control steps before the contact, by its `search`: half of those in
-    which it takes on the target's velocity save it from going back and forth."""
+    """The hover position is above the target's position this many control steps before contact, used by ``search``:
+    half of the steps in which the tool matches velocity keep it from moving back and forth."""
     lead_steps: int = 1
-    """Control steps that a tool lags behind a goal that moves: goals are so much ahead."""
+    """Control steps by which the tool lags behind a moving goal; goals lead by as much."""
     along_by: float = 0.7
-    """Share of the descent by which it flies along with the target, across the axis."""
+    """Share of the descent after which the velocities across the axis match."""
     down_after: float = 0.4
-    """Share of the descent after which it comes down, along the axis."""
+    """Share of the descent after which the motion along the axis starts."""
     within: float = math.inf
-    """A tool farther than this from the target at contact has missed it, and hovers again [m]."""
+    """A tool farther than this from the target at contact has missed, and hovers again [m]."""
     axis: tuple[float, ...] | None = None
-    """Direction from the target to where the tool hovers, of any length; up for None, along the last coordinate."""
+    """Direction from the target to the hover position, of any length; None for up, along the last coordinate."""
 
     State: ClassVar[type[MatchState]] = MatchState
 
@@ -103,16 +104,16 @@ class MatchVelocity:
 
     @property
     def lookahead(self) -> int:
-        """Positions of the target's path that it reads: that of its goal, and the next one."""
+        """Number of positions it reads from the target's path: the goal's, and the next one."""
         return self.lead_steps + 2
 
     def search(self, *, coordinates: int = 3, **settings: Any) -> ExactSearch:
-        """A search for the earliest meeting that leaves the tool time to come down from where it hovers.
+        """A search for the earliest meeting that leaves the tool time to hover and descend.
 
         Args:
-            coordinates: D of places.
-            settings: of `ExactSearch`, in place of those that are chosen here: all steps of the forecast are looked at,
-                and a meeting that is planned is kept unless another is 50 control steps earlier.
+            coordinates: D, coordinates of a position.
+            settings: settings of `ExactSearch` that override the defaults here: every step of the forecast is a
+                candidate, and a planned meeting is kept unless another is 50 control steps earlier.
         """
         offset = tuple((self.hover * self._up(torch.zeros(coordinates, dtype=torch.float64))).tolist())
         own: dict[str, Any] = {"stride": 1, "first": 1, "offset": offset, "descent_steps": float(self.descent_steps)}
@@ -121,14 +122,14 @@ class MatchVelocity:
         return ExactSearch(**(own | settings))
 
     def start(self, observation: Observation) -> MatchState:
-        """Nothing has begun."""
+        """State before the descent."""
         zero = torch.zeros_like(observation.tool_pos)
         return MatchState(torch.full_like(observation.step_count, -1), observation.tool_pos, zero)
 
     def __call__(
         self, plan: Plan, observation: Observation, holds: Tensor, state: MatchState
     ) -> tuple[Tensor, MatchState]:
-        """Above the meeting place, down with the target, on it, or up again."""
+        """The goal of each row's phase, and the next state."""
         tool_pos, up = observation.tool_pos, self._up(observation.tool_pos)
         place, later = plan.ahead(self.lookahead)[..., -2:, :].unbind(-2)
         step = self._next(plan, observation, holds, state.match_step)
@@ -144,11 +145,11 @@ class MatchVelocity:
         return torch.cat([goal, turn], dim=-1) if turn.shape[-1] else goal, MatchState(step, came, velocity)
 
     def committed(self, state: MatchState) -> Tensor:
-        """As of `torchdyn_plan.planners.choice.Commits`: from when it comes down until it has risen."""
+        """See `torchdyn_plan.planners.choice.Commits`: true from the start of the descent to the end of the lift."""
         return (state.match_step >= 0) & ~self.finished(state)
 
     def finished(self, state: MatchState) -> Tensor:
-        """As of `torchdyn_plan.planners.choice.Commits`: it has risen."""
+        """See `torchdyn_plan.planners.choice.Commits`: true after the lift."""
         steps = self.descent_steps if self.lift_steps is None else self.lift_steps
         return state.match_step >= self.descent_steps + self.hold_steps + steps
 
@@ -158,7 +159,7 @@ class MatchVelocity:
         return begun.long() + on + (match_step >= self.descent_steps + self.hold_steps)
 
     def _next(self, plan: Plan, observation: Observation, holds: Tensor, before: Tensor) -> Tensor:
-        """Control steps since the descent began, ``(*B,)``, a step after ``before`` (*B,)."""
+        """``match_step`` (*B,) one control step after ``before`` (*B,)."""
         step = torch.where(before >= 0, before + 1, before)
         away = torch.linalg.vector_norm(observation.tool_pos - observation.target_pos, dim=-1)
         step = step.masked_fill((step == self.descent_steps) & (away > self.within), -1)
@@ -166,7 +167,7 @@ class MatchVelocity:
         return step.masked_fill((step < 0) & due, 0)
 
     def _down(self, step: Tensor, came: Tensor, place: Tensor, up: Tensor) -> Tensor:
-        """Goal ``(*B, D)`` on the way from where it ``came`` (*B, D) to ``place`` (*B, D), ``step`` (*B,) into it."""
+        """Goal ``(*B, D)`` at ``step`` (*B,) of the descent from ``came`` (*B, D) to ``place`` (*B, D)."""
         share = ((step + self.lead_steps) / self.descent_steps).to(came.dtype).clamp(0.0, 1.0).unsqueeze(-1)
         way = place - came
         along = (way * up).sum(-1, keepdim=True) * up
@@ -175,23 +176,23 @@ class MatchVelocity:
         return came + flown * (way - along) + lowered * along
 
     def _lifted(self, step: Tensor, came: Tensor, velocity: Tensor, up: Tensor) -> Tensor:
-        """Goal ``(*B, D)`` on the way up from where it ``came`` (*B, D), with ``velocity`` (*B, D) at first."""
+        """Goal ``(*B, D)`` of the lift from ``came`` (*B, D), with initial ``velocity`` (*B, D)."""
         steps = self.descent_steps if self.lift_steps is None else self.lift_steps
         passed = (step - self.descent_steps - self.hold_steps).to(came.dtype).clamp(0.0, float(steps)).unsqueeze(-1)
         gone = velocity * (passed - 0.5 * passed.square() / steps)
         return came + gone + (self.hover if self.lift is None else self.lift) * smooth(passed / steps) * up
 
     def _up(self, like: Tensor) -> Tensor:
-        """The axis, ``(D,)`` of length 1, of the type of ``like`` (*B, D)."""
+        """The axis as a unit vector ``(D,)``, of the type of ``like`` (*B, D)."""
         size = like.shape[-1]
         if self.axis is None:
             return torch.eye(size, dtype=like.dtype, device=like.device)[-1]
         if len(self.axis) != size:
-            raise InputError(f"axis has {len(self.axis)} numbers, but places have {size} coordinates")
+            raise InputError(f"axis has {len(self.axis)} numbers, but positions have {size} coordinates")
         return torch.nn.functional.normalize(like.new_tensor(self.axis), dim=-1)
 
 
 def smooth(share: Tensor) -> Tensor:
-    """10 s³ - 15 s⁴ + 6 s⁵ of ``share`` (*B,) cut to 0 … 1: from 0 to 1, its first two derivatives 0 at both ends."""
+    """10 s³ - 15 s⁴ + 6 s⁵ of ``share`` (*B,) clamped to 0 … 1; its first two derivatives are 0 at both ends."""
     s = share.clamp(0.0, 1.0)
     return s**3 * (10.0 + s * (6.0 * s - 15.0))

@@ -1,4 +1,4 @@
-"""What planners remember between steps: in the tensordict under ``plan``, stored, recalled and reset here alone."""
+"""The planners' memory between steps: kept in the tensordict under ``plan``; stored, recalled and reset only here."""
 
 from __future__ import annotations
 
@@ -27,33 +27,33 @@ if TYPE_CHECKING:
 
 
 class Slot(NamedTuple):
-    """Where the state of one part is stored in the memory, and how it starts and ages."""
+    """How the state of one part is stored in the memory, and how it starts and ages."""
 
     kind: type[Any]
     """Its `NamedTuple` of tensors ``(*B, …)``."""
     names: tuple[str, ...]
-    """Its entries below ``plan``, a field each."""
+    """Its entries under ``plan``, one for each field."""
     start: Callable[[Observation], Any]
     """The state of rows at their first step."""
     older: Callable[[Any], Any] | None
-    """The state one control step later; None for one that does not age."""
+    """The state one control step later; None if it does not age."""
 
 
 REPORTED = ("replanned", "status")
-"""Written beside the memory, for people to read: whether a row planned at this step, and its `PlanStatus`."""
+"""Also written, for diagnosis: whether a row planned at this step, and its `PlanStatus`."""
 SPARE_STEPS = 8
-"""A path is remembered for so many control steps at least, in case the next plan is late."""
+"""Extra control steps for which a path is kept, in case the next plan is late."""
 
 
 class PlannerMemory:
-    """The memory of a composed planner: its clock, its plan in use, its maneuver's state, and plans under way."""
+    """The memory of a composed planner: its clock, plan in use, maneuver state, and plans under way."""
 
     def __init__(
         self, schedule: Schedule, maneuver: Maneuver, delivery: Delivery | None, *, turned: bool = False
     ) -> None:
-        """Lay the memory out for these parts; raises `InputError` where two of them use one name.
+        """Lay out the memory for these parts; raises `InputError` if two of them use the same name.
 
-        With ``turned`` goals say how the tool is turned.
+        With ``turned``, goals include the tool's orientation.
         """
         delay = 0 if delivery is None else delivery.delay
         lookahead = max(maneuver.lookahead, int(schedule.watches))
@@ -76,13 +76,13 @@ class PlannerMemory:
             raise InputError(f"two parts of a planner remember {', '.join(repeated)}: rename a field of a State")
 
     def recall(self, tensordict: TensorDictBase, observation: Observation, spoiled: Tensor | None = None) -> list[Any]:
-        """The parts' states as they were after the step before, one step older; rows at step 0 start afresh.
+        """The parts' states after the last step, aged by one step, in the order of ``slots``.
 
-        The states are in the order of `slots`. Rows whose memory is ``spoiled`` (*B,) start afresh, too. Where a
-        tensordict holds none, everything does, with a warning if rows are past step 0.
+        Rows at step 0 and rows whose memory is ``spoiled`` (*B,) restart. If the tensordict holds no memory all rows
+        restart, with a warning if some are past step 0.
         """
         plan = tensordict.get(keys.PLAN, None)
-        # A plain dictionary: a look-up in a tensordict takes as long as a small operation.
+        # A plain dictionary: a look-up in a tensordict costs as much as a small tensor operation.
         stored = {} if plan is None else dict(plan.items())
         fresh = observation.step_count == 0
         lost = [name for name in self.names if name not in stored]
@@ -106,14 +106,14 @@ class PlannerMemory:
         return states
 
     def remember(self, tensordict: TensorDictBase, states: Sequence[Any], **report: Tensor) -> None:
-        """Store the parts' states, in the order of `slots`, and a ``report`` of `REPORTED`."""
+        """Store the parts' states, in the order of ``slots``, and a ``report`` with the names `REPORTED`."""
         entries: dict[str, Tensor] = report
         for slot, state in zip(self.slots, states, strict=True):
             entries.update(zip(slot.names, state, strict=True))
         remember(tensordict, entries)
 
     def empty(self, observation: Observation) -> dict[str, Tensor]:
-        """The entries of rows that have not begun."""
+        """The entries of rows at their first step."""
         states = [(slot.names, slot.start(observation)) for slot in self.slots]
         return {name: value for names, state in states for name, value in zip(names, state, strict=True)}
 
@@ -123,17 +123,17 @@ def warn_of_loss(name: str, fresh: Tensor) -> None:
     if torch.compiler.is_compiling() or bool(debug_unwrap(fresh).all()):
         return
     warnings.warn(
-        f"a planner remembers nothing ('plan', {name!r} is absent) in rows that are past step 0, and starts afresh "
-        "there: carry its memory from step to step; an environment does with planner.make_tensordict_primer()",
+        f"the planner's memory is missing ('plan', {name!r} is absent) in rows that are past step 0, and it restarts "
+        "there: carry it from step to step; an environment does with planner.make_tensordict_primer()",
         RuntimeWarning,
         stacklevel=2,
     )
 
 
 def remember(tensordict: TensorDictBase, entries: Mapping[str, Tensor]) -> None:
-    """Put ``entries`` below ``plan``; what others keep there stays.
+    """Store ``entries`` under ``plan``; other entries there stay.
 
-    The memory is a new one at each step: tensordicts of earlier steps may share the old one.
+    Each step gets a new ``plan``, because tensordicts of earlier steps may share the old one.
     """
     stored = tensordict.get(keys.PLAN, None)
     # A plain dictionary: to look at a tensordict takes as long as a small operation.
@@ -151,8 +151,8 @@ def remember(tensordict: TensorDictBase, entries: Mapping[str, Tensor]) -> None:
 class Remembering(TensorDictModuleBase):
     """A planner that keeps its memory in the tensordict under ``plan``.
 
-    Where it fails for what is in the tensordict, an `InputError` says so in one sentence. Nothing is looked at before
-    something fails: a step that works costs nothing more.
+    If it fails because of the tensordict's content, an `InputError` explains it in one sentence. The content is
+    examined only after a failure, so that a step that works costs nothing extra.
     """
 
     def __call__(self, tensordict: Any, *more: Any, **settings: Any) -> Any:
@@ -168,14 +168,14 @@ class Remembering(TensorDictModuleBase):
             raise explanation from error
 
     def empty_memory(self, like: Tensor) -> dict[str, Tensor]:
-        """Entries below ``plan`` of rows at step 0, in the batch, type and device of ``like`` (*B, D); none here."""
+        """Entries under ``plan`` of rows at step 0, with the batch, type and device of ``like`` (*B, D); here none."""
         return {}
 
     def make_tensordict_primer(self, dtype: torch.dtype = torch.float32, coordinates: int = 3) -> Any:
-        """A TorchRL transform that lets environments carry the memory, `torchrl.envs.TensorDictPrimer`.
+        """A TorchRL transform that makes environments carry the memory, `torchrl.envs.TensorDictPrimer`.
 
-        Environments that run in other processes, and collectors over them, carry nothing that no spec declares.
-        ``dtype`` is that of the environment's positions, and ``coordinates`` how many they have.
+        Environments in other processes, and collectors over them, only carry what a spec declares. ``dtype`` is that of
+        the environment's positions, and ``coordinates`` their number.
         """
         from torchrl.data import Composite, Unbounded
         from torchrl.envs.transforms import TensorDictPrimer

@@ -10,7 +10,7 @@ from torch import Tensor
 from torchdyn_plan import keys
 
 SEEN_BY_ALL = (keys.TOOL_POS, keys.TARGET_POS, keys.ROBOT_STATE, keys.STEP_COUNT)
-"""Keys of an observation beside those that the forecaster reads."""
+"""Keys of an observation, without those that the forecaster reads."""
 
 
 class Observation(NamedTuple):
@@ -21,17 +21,17 @@ class Observation(NamedTuple):
     target_pos: Tensor
     """``(*B, D)`` [m, world]."""
     robot_state: Tensor
-    """``(*B, S)``: what the arrival model reads."""
+    """``(*B, S)``, read by the arrival model."""
     step_count: Tensor
     """``(*B,)`` int64 control steps since the reset."""
     seen: tuple[Tensor, ...]
-    """What the forecaster reads, ``(*B, …)`` each."""
+    """Values read by the forecaster, ``(*B, …)`` each."""
 
     def flat(self) -> tuple[Tensor, ...]:
-        """Every tensor, one after the other."""
+        """All tensors in one flat tuple."""
         return (*self[:4], *self.seen)
 
     @classmethod
     def of(cls, tensors: Sequence[Tensor]) -> Observation:
-        """The observation of which `flat` gave ``tensors``."""
+        """The inverse of `flat`."""
         return cls(tensors[0], tensors[1], tensors[2], tensors[3], tuple(tensors[4:]))

@@ -1,4 +1,4 @@
-"""A rival that needs no training and no forecast: the static plan at another pace, along a path that is shifted."""
+"""A baseline without training or forecast: the static plan, sped up or slowed down along a shifted path."""
 
 from __future__ import annotations
 
@@ -19,28 +19,28 @@ from torchdyn_plan.planners.rows import where_rows
 from torchdyn_plan.planners.static.callable import TensorDictFunction
 
 SHORTEST = 1e-3
-"""A way is taken for no shorter than this [m]: along one that is nothing there is no pace."""
+"""Lower bound on the length of the way to the goal [m]: a way of length 0 has no pace."""
 
 
 class Correction(NamedTuple):
-    """What becomes of the static plan to where the target is now."""
+    """Correction of the static plan to the target's present position."""
 
     goal: Tensor
-    """``(*B, 3)`` where it ends instead [m, world]."""
+    """``(*B, 3)`` its shifted end [m, world]."""
     pace: Tensor
-    """``(*B,)`` how much faster it is gone through."""
+    """``(*B,)`` factor on its speed."""
     time: Tensor
-    """``(*B,)`` from now to its end [s]."""
+    """``(*B,)`` time from now to its end [s]."""
 
 
 class PaceAndPath(Remembering):
-    """Goes through the static plan at another pace, and shifts it by how far the target comes meanwhile.
+    """Executes the static plan at another pace, shifted by the distance that the target moves meanwhile.
 
-    Built from the published idea of *Pace-and-Path Correction* (Zhang et al., arXiv:2605.11459, 2026), which corrects
-    the action chunks of a policy that takes the world for static; no reimplementation: here the static plan is a
-    straight way at a known speed to where the target is now, and the target's velocity is that of the last step of its
-    history. What the target covers along that way is made up for by the pace, so that the plan takes as long as
-    before; what it covers across shifts the end of the path. Where no pace will do, the plan takes longer.
+    Follows the idea of *Pace-and-Path Correction* (Zhang et al., arXiv:2605.11459, 2026), which corrects the action
+    chunks of a policy trained for a static world. It is not a reimplementation: here the static plan is a straight line
+    at known speed to the target's present position, and the target's velocity is that of the last step of its history.
+    Target motion along the line is compensated by the pace, so that the plan takes as long as before; motion across it
+    shifts the end of the path. If no allowed pace is enough, the plan takes longer.
     """
 
     def __init__(
@@ -58,13 +58,15 @@ class PaceAndPath(Remembering):
         """Correct the plans of ``static``.
 
         Args:
-            static: a planner for a static goal, whose actions are speeds: a share of one is the same way, slower.
+            static: a planner for a static goal whose actions are speeds, so that a scaled action is the same path,
+                slower.
             speed: of the tool on its way [m/s].
             control_step: time between two steps [s].
-            settle: time at the end of a plan in which the tool gets no nearer, as it drops a box; at its own pace [s].
-            slowest: least pace, a share of the static planner's actions.
-            fastest: greatest pace; 1 for a static planner that goes as fast as it can.
-            longest: a plan takes no longer [s].
+            settle: time at the end of a plan in which the tool gets no nearer, such as the drop of a box; always at
+                pace 1 [s].
+            slowest: smallest pace, as a factor on the static planner's actions.
+            fastest: largest pace; 1 for a static planner that already moves as fast as it can.
+            longest: longest time of a plan [s].
             scene: digest of the static planner's scene, if it has one.
         """
         super().__init__()
@@ -104,11 +106,11 @@ class PaceAndPath(Remembering):
         return tensordict.set(keys.ACTION, action.clamp(-1.0, 1.0))
 
     def correct(self, tool_pos: Tensor, target_pos: Tensor, velocity: Tensor) -> Correction:
-        """The correction for tools and targets at places (*B, 3) [m], targets with ``velocity`` (*B, 3) [m/s, world].
+        """The correction for tools and targets at positions (*B, 3) [m]; ``velocity`` (*B, 3) is the target's [m/s].
 
-        At pace p the tool covers p·speed·(t - settle) of its way in t seconds, and the target is farther along that
-        way by v·t: both are at one place at t = (way + p·speed·settle) / (p·speed - v). The pace that is told is that
-        of the way to the shifted end in that time.
+        At pace p the tool covers p·speed·(t - settle) of its way in t seconds, and the target moves on by v·t along
+        it: they meet at t = (way + p·speed·settle) / (p·speed - v). The returned pace is the one that covers the way to
+        the shifted end in that time.
         """
         offset = target_pos - tool_pos
         way = offset.square().sum(-1).clamp_min(SHORTEST**2).sqrt()
@@ -117,21 +119,21 @@ class PaceAndPath(Remembering):
         pace = (1.0 + along * unchanged / way).clamp(self.slowest, self.fastest)
         closing = pace * self.speed - along
         time = (way + pace * self.speed * self.settle) / closing.clamp_min(1e-9)
-        # One that runs away faster is never met: its place at the longest time is as good as any.
+        # A target that moves away faster is never met; take its position at the longest time.
         time = torch.where(closing > 0.0, time, self.longest).clamp_max(self.longest)
         goal = target_pos + velocity * time.unsqueeze(-1)
         shifted = (goal - tool_pos).square().sum(-1).clamp_min(SHORTEST**2).sqrt()
         left = time - self.settle
-        # What is still to be done when nothing is left of the way is done at its own pace.
+        # What remains when the way is covered (settling) runs at pace 1.
         needed = shifted / (self.speed * left.clamp_min(1e-9))
         pace = torch.where(left > 0.0, needed.clamp(self.slowest, self.fastest), 1.0)
         return Correction(goal, pace, time)
 
     def empty_memory(self, like: Tensor) -> dict[str, Tensor]:
-        """The static planner's, as `Remembering` says."""
+        """The static planner's memory, see `Remembering`."""
         return self.static.empty_memory(like) if isinstance(self.static, Remembering) else {}
 
     def part_settings(self) -> dict[str, Any]:
-        """Arguments that make the same planner."""
+        """Constructor arguments of this planner."""
         names = ("static", "speed", "control_step", "settle", "slowest", "fastest", "longest", "scene")
         return {name: getattr(self, name) for name in names}

@@ -1,4 +1,4 @@
-"""What a dynamic planner is made of: parts that can be exchanged, and what follows from them."""
+"""The exchangeable parts of a dynamic planner, and what follows from them."""
 
 from __future__ import annotations
 
@@ -30,15 +30,15 @@ from torchdyn_plan.planners.static.callable import TensorDictFunction
 from torchdyn_plan.planners.turn import Turn
 
 PARTS = ("static", "forecaster", "eta", "search", "schedule", "maneuver", "delivery", "lost", "turn", "chunk", "scene")
-"""Arguments of a `ComposedPlanner`, and its attributes."""
+"""Arguments of a `ComposedPlanner`, which are also its attributes."""
 
 
 class ComposedPlanner(PretrainedPlanner, Remembering):
     """Holds the parts of a planner for a moving target; `DynamicPlanner` uses them.
 
-    Parts are immutable: `with_parts` makes another planner. In evaluation mode, in which planners are
-    loaded, ``prepared`` holds copies of its models for inference. Plans are made by these wherever they stand for the
-    models: `torchdyn_plan.nets.inference.Prepared` says where. ``train()`` drops them, ``eval()`` makes them again.
+    Parts are immutable: `with_parts` makes another planner. In evaluation mode, in which planners are loaded,
+    ``prepared`` holds copies of its models for inference, and plans are made with these copies where
+    `torchdyn_plan.nets.inference.Prepared` allows it. ``train()`` drops them, ``eval()`` makes them again.
     """
 
     prepared: Prepared | None = None
@@ -62,22 +62,22 @@ class ComposedPlanner(PretrainedPlanner, Remembering):
 
         Args:
             static: planner for a static goal, from tensordict to tensordict (`StaticPlanner`).
-            forecaster: forecasts the target; a function of its history will do, which returns positions (*B, F, D). By
-                default constant velocity, `torchdyn_plan.nets.ConstantVelocity`.
-            eta: predicts how long ``static`` needs to a goal; may be a function from robot states (*B, 1, S) and goals
-                (*B, K, D) to control steps (*B, K). By default ``static.arrival_model()``.
+            forecaster: forecasts the target; may be a function from its history to positions (*B, F, D). By default
+                constant velocity, `torchdyn_plan.nets.ConstantVelocity`.
+            eta: predicts the time that ``static`` needs to a goal; may be a function from robot states (*B, 1, S) and
+                goals (*B, K, D) to control steps (*B, K). By default ``static.arrival_model()``.
             search: chooses the meeting on the forecast; by default the first step at which both can be there.
             schedule: when to plan again; every fourth control step by default.
             maneuver: chooses the goal of the static planner at each step; the meeting place by default.
             delivery: when plans become available: `Delayed` or `Background`; at once by default.
-            lost: decides when a target is lost; None if it cannot be.
-            turn: orientation of the tool where it meets the target; then ``goal_pose`` is written beside ``goal``, of
-                three coordinates, and ``static`` and ``eta`` should read it. None for positions alone.
+            lost: decides when a target is lost; None if targets cannot be lost.
+            turn: orientation of the tool where it meets the target. Then ``goal_pose`` is written in addition to
+                ``goal``, of three coordinates, and ``static`` and ``eta`` should read it. None for positions only.
             chunk: plan in blocks of exactly this many rows, so that results do not depend on the batch size.
             scene: digest of the scene that the planner belongs to; None if it belongs to none.
 
         Raises:
-            InputError: a part is of no use, or there is no ``eta`` and ``static`` tells none.
+            InputError: a part is invalid, or no ``eta`` is given and ``static`` has no ``arrival_model``.
         """
         super().__init__()
         if chunk is not None:
@@ -90,10 +90,12 @@ class ComposedPlanner(PretrainedPlanner, Remembering):
         self.maneuver, self.delivery = GoTo() if maneuver is None else maneuver, delivery
         self.lost, self.chunk, self.scene, self.turn = lost, chunk, scene, turn
         if turn is not None and not getattr(self.search, "reads_turn", False):
-            raise InputError(f"{type(self.search).__name__} knows no turn of the tool: search with an ExactSearch")
+            raise InputError(
+                f"{type(self.search).__name__} does not support a turn of the tool: search with an ExactSearch"
+            )
         if turn is None and keys.GOAL_POSE in self.static.in_keys:
             raise InputError(
-                f"{type(static).__name__} reads {keys.GOAL_POSE}: give the planner a turn, as WithTarget()"
+                f"{type(static).__name__} reads {keys.GOAL_POSE}: give the planner a turn such as WithTarget()"
             )
         self.memory = PlannerMemory(self.schedule, self.maneuver, delivery, turned=turn is not None)
         remembered = [(keys.PLAN, name) for name in self.memory.names]
@@ -103,7 +105,7 @@ class ComposedPlanner(PretrainedPlanner, Remembering):
         self.in_keys = keys_read(self.static, *seen, *remembered)
         shared = [str(key[-1]) for key in (*remembered, *reported) if key in self.static.out_keys]
         if shared:
-            raise InputError(f"the static planner and the planner both remember {', '.join(shared)}")
+            raise InputError(f"the static planner and the planner both store {', '.join(shared)}")
         goals = (keys.GOAL,) if turn is None else (keys.GOAL, keys.GOAL_POSE)
         self.out_keys = keys_written(self.static, *goals, keys.ARRIVAL_STEPS, *remembered, *reported)
         self.read_besides = [key for key in self.in_keys if key not in seen]
@@ -128,10 +130,10 @@ class ComposedPlanner(PretrainedPlanner, Remembering):
         return type(self)(**(self.part_settings() | parts)).train(self.training)
 
     def for_noise(self, noise: float) -> Self:
-        """The planner for targets that a track sees by measurements of standard deviation ``noise`` [m].
+        """The planner for targets tracked from measurements of standard deviation ``noise`` [m].
 
-        It is another one where its forecaster has another for them; that one plans as soon as a target is seen well
-        enough for it.
+        This is another planner if the forecaster has a variant for that noise; it then plans as soon as the target is
+        tracked well enough for it.
         """
         forecaster = self.forecaster.for_noise(noise)
         if forecaster is self.forecaster:
@@ -142,32 +144,32 @@ class ComposedPlanner(PretrainedPlanner, Remembering):
         return self.with_parts(forecaster=forecaster, schedule=schedule)
 
     def part_settings(self) -> dict[str, Any]:
-        """Arguments that make the same planner."""
-        # Planners that are older than the turn keep their description.
+        """Constructor arguments of this planner."""
+        # Left out if absent, so that planners saved before turns existed keep their description.
         return {name: getattr(self, name) for name in PARTS if name != "turn" or self.turn is not None}
 
     def train(self, mode: bool = True) -> Self:
-        """As of every module, and prepare the models where they are not to be trained."""
+        """Set the mode, and prepare the models for inference in evaluation mode."""
         super().train(mode)
         return self.prepare()
 
     def requires_grad_(self, requires_grad: bool = True) -> Self:
-        """As of every module, and prepare the models where they have no derivatives."""
+        """Freeze or unfreeze the weights, and prepare the models again."""
         super().requires_grad_(requires_grad)
         return self.prepare()
 
     def prepare(self) -> Self:
-        """Copy the models as they are now, for inference; in training mode leave the copies. Returns the planner."""
+        """Copy the current models for inference, or drop the copies in training mode. Returns the planner."""
         self.prepared = None if self.training else Prepared.of(self.forecaster.chosen, self.eta)
         return self
 
     def _apply(self, fn: Callable[[Tensor], Tensor], recurse: bool = True) -> Self:
-        """As of every module, which moves and converts by it."""
+        """Move or convert, and prepare the models again."""
         super()._apply(fn, recurse)
         return self.prepare()
 
     def __getstate__(self) -> dict[str, Any]:
-        # A copy has other weights, from which it prepares its models.
+        # A copy prepares its models from its own weights.
         return {**self.__dict__, "prepared": None}
 
     def __setstate__(self, state: dict[str, Any]) -> None:
@@ -175,22 +177,22 @@ class ComposedPlanner(PretrainedPlanner, Remembering):
         self.prepare()
 
     def for_inference(self) -> Self:
-        """The same planner on copies of its networks as they are now, in as few operations as possible."""
+        """A copy with the current networks prepared for inference, in as few operations as possible."""
         return self.with_parts(forecaster=self.forecaster.for_inference(), eta=self.eta.for_inference())
 
     def empty_memory(self, like: Tensor) -> dict[str, Tensor]:
-        """Entries below ``plan`` of rows at step 0, the static planner's among them; as `Remembering` says."""
+        """Entries under ``plan`` of rows at step 0, including the static planner's, see `Remembering`."""
         step = torch.zeros(like.shape[:-1], dtype=torch.int64, device=like.device)
         entries = self.memory.empty(Observation(like, like, like, step, ()))
         return entries | (self.static.empty_memory(like) if isinstance(self.static, Remembering) else {})
 
 
 def arrival_of(static: Any) -> ArrivalModel:
-    """What ``static`` says of its own arrival times; raises `InputError` if it says nothing."""
+    """The ``arrival_model`` of ``static``; raises `InputError` if it has none."""
     tells = getattr(static, "arrival_model", None)
     if tells is None:
         raise InputError(
-            f"eta is needed, as {type(static).__name__} has no arrival_model that tells how long it takes to a goal: "
+            f"eta is needed, because {type(static).__name__} has no arrival_model that predicts its time to a goal: "
             "give a function of robot states and goals, or a model of torchdyn_plan.nets"
         )
     return tells()

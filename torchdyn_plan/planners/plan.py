@@ -16,37 +16,37 @@ from torchdyn_plan.planners.observation import Observation
 from torchdyn_plan.planners.search.meeting import Meeting
 
 FARTHEST = 1e3
-"""A forecast that leads farther than this is none [m]."""
+"""A forecast that leaves this range is bad [m]."""
 
 
 class PlanStatus(IntEnum):
     """Codes of ``plan.status``, row by row; from `BAD_FORECAST` on a row whose plan is due holds its tool still."""
 
     OK = 0
-    """The robot can be in time for the planned meeting."""
+    """The robot can reach the planned meeting in time."""
     WAITING = 1
-    """The first plan is still to come."""
+    """No plan has been made yet."""
     UNREACHABLE = 2
-    """The robot cannot be in time for any meeting on the forecast; the goal is only a direction."""
+    """The robot cannot reach any meeting on the forecast in time; the goal only gives a direction."""
     BAD_FORECAST = 3
-    """The forecast holds a NaN or an infinity, or leads out of the world."""
+    """The forecast holds a NaN or an infinity, or is out of range."""
     TARGET_LOST = 4
     """The target is lost."""
     BAD_INPUT = 5
-    """An entry that is read of the target or the robot is NaN, infinite, or too large to be a measurement."""
+    """An input value of the target or the robot is NaN, infinite, or too large to be a measurement."""
     NO_TRACK = 6
-    """Too little was measured of the target, or too long ago, to know where it is."""
+    """There are too few measurements of the target, or they are too old, to know where it is."""
 
 
 class Lost(Protocol):
-    """Says of places whether a target there is lost; a task whose targets cannot be lost has none."""
+    """Decides whether a target at a position is lost; a task whose targets cannot be lost has none."""
 
     def seen(self, target_pos: Tensor) -> Tensor:
-        """Whether a target that is seen at ``target_pos`` (*B, D) [m, world] is lost: ``(*B,)`` bool."""
+        """Whether a target observed at ``target_pos`` (*B, D) [m, world] is lost: ``(*B,)`` bool."""
         ...
 
     def forecast(self, path: Tensor) -> Tensor:
-        """Whether a target that is forecast at each place of ``path`` (*B, F, D) is lost there: ``(*B, F)`` bool."""
+        """Whether a target forecast at each position of ``path`` (*B, F, D) is lost there: ``(*B, F)`` bool."""
         ...
 
 
@@ -55,10 +55,10 @@ class LostBelow:
     """A target is lost once it is below a height."""
 
     seen_below: float
-    """Height below which a target that is seen is lost [m, world]."""
+    """Height below which an observed target is lost [m, world]."""
     forecast_below: float
-    """A target that is forecast at this height or below is taken for lost [m, world]; between the heights of targets
-    that are lost and of those that are not, as a forecast that is unsure lies between them."""
+    """Height at or below which a forecast target counts as lost [m, world]. Set it between the heights of lost targets
+    and of others, because an uncertain forecast lies between them."""
 
     def __post_init__(self) -> None:
         check_number("seen_below", self.seen_below)
@@ -79,12 +79,12 @@ class LostBelow:
 
 @dataclass(frozen=True, kw_only=True)
 class MetWithin:
-    """A target is met within a box alone, as where a robot is quick and clear of its limits; outside it is not lost."""
+    """Allows meetings inside a box only, for example where a robot is clear of its limits; a target is never lost."""
 
     low: tuple[float, ...]
-    """Least coordinates of the box, a number for each axis [m, world]."""
+    """Lower corner of the box, one number for each axis [m, world]."""
     high: tuple[float, ...]
-    """Greatest coordinates [m, world]."""
+    """Upper corner of the box [m, world]."""
 
     def __post_init__(self) -> None:
         for name in ("low", "high"):
@@ -93,44 +93,44 @@ class MetWithin:
             raise InputError(f"low must be below high along each axis, got {self.low!r} and {self.high!r}")
 
     def seen(self, target_pos: Tensor) -> Tensor:
-        """As `Lost.seen`: never."""
+        """See `Lost.seen`: never."""
         return torch.zeros_like(target_pos[..., 0], dtype=torch.bool)
 
     def forecast(self, path: Tensor) -> Tensor:
-        """As `Lost.forecast`: outside of the box."""
+        """See `Lost.forecast`: outside the box."""
         if path.shape[-1] != len(self.low):
-            raise InputError(f"the box has {len(self.low)} axes, but places have {path.shape[-1]} coordinates")
+            raise InputError(f"the box has {len(self.low)} axes, but positions have {path.shape[-1]} coordinates")
         return ((path < path.new_tensor(self.low)) | (path > path.new_tensor(self.high))).any(-1)
 
 
 def no_height(place: Tensor) -> InputError:
-    """The error about places of other than three coordinates, which have no height."""
-    return InputError(f"LostBelow needs points of 3 coordinates, got {place.shape[-1]}: in a plane nothing is below")
+    """The error for positions without three coordinates, which have no height."""
+    return InputError(f"LostBelow needs points of 3 coordinates, got {place.shape[-1]}: a plane has no height")
 
 
 class Plan(NamedTuple):
     """The plan in use in each row."""
 
     goal: Tensor
-    """``(*B, D)`` [m, world]; where the planner says how the tool is turned there, its quaternion wxyz follows."""
+    """``(*B, D)`` [m, world]; followed by the tool's quaternion wxyz if the planner has a turn."""
     arrival_steps: Tensor
     """``(*B,)`` int64 control steps from now to the meeting."""
     clamped: Tensor
-    """``(*B,)`` bool, as `Meeting.clamped`."""
+    """``(*B,)`` bool, see `Meeting.clamped`."""
     reachable: Tensor
-    """``(*B,)`` bool, as `Meeting.reachable`."""
+    """``(*B,)`` bool, see `Meeting.reachable`."""
     usable: Tensor
-    """``(*B,)`` bool: the forecast from which it was made was of use."""
+    """``(*B,)`` bool: the forecast behind it was usable."""
     path: Tensor
-    """``(*B, T, D)`` [m, world]: where the target was expected in 0 … T-1 steps from the moment it was made for."""
+    """``(*B, T, D)`` [m, world]: forecast of the target 0 … T-1 steps after the step that the plan was made for."""
     age: Tensor
-    """``(*B,)`` int64 control steps since that moment; -1 where no plan was made yet."""
+    """``(*B,)`` int64 control steps since that step; -1 before the first plan."""
 
     @classmethod
     def hold(cls, observation: Observation, length: int, *, turned: bool = False) -> Plan:
-        """The plan of rows that have none: stay where the tool is, and expect the target to stay where it is.
+        """The plan of rows that have none: the tool stays, and the target is expected to stay.
 
-        With ``turned`` goals are followed by a quaternion: zeros, so that the tool stays turned as it is.
+        With ``turned``, goals are followed by a zero quaternion, which keeps the tool's orientation.
         """
         tool_pos, target_pos, step = observation.tool_pos, observation.target_pos, observation.step_count
         yes = torch.ones_like(step, dtype=torch.bool)
@@ -143,11 +143,11 @@ class Plan(NamedTuple):
         """A new plan.
 
         Args:
-            meeting: what the search found.
-            usable: ``(*B,)`` whether the forecast was of use.
-            target_pos: ``(*B, D)`` the target at the moment for which the plan is made [m, world].
-            path: ``(*B, F, D)`` where it is expected from then on.
-            length: positions to remember; the last one is repeated where the forecast ends.
+            meeting: result of the search.
+            usable: ``(*B,)`` whether the forecast was usable.
+            target_pos: ``(*B, D)`` the target's position at the step for which the plan is made [m, world].
+            path: ``(*B, F, D)`` its forecast from then on.
+            length: number of positions to keep; the last one is repeated after the end of the forecast.
         """
         whole = path.narrow(-2, 0, 0)
         if length:
@@ -160,7 +160,7 @@ class Plan(NamedTuple):
         return self._replace(arrival_steps=(self.arrival_steps - 1).clamp_min(0), age=self.age + (self.age >= 0))
 
     def held(self, rows: Tensor, tool_pos: Tensor) -> Plan:
-        """The plan, but ``rows`` (*B,) bool stay where their tool is, (*B, D) [m, world]."""
+        """The plan with ``rows`` (*B,) bool holding their tool at ``tool_pos`` (*B, D) [m, world]."""
         if not (torch.compiler.is_compiling() or debug_unwrap(rows).any()):
             return self
         stay = tool_pos
@@ -174,13 +174,13 @@ class Plan(NamedTuple):
         )
 
     def ahead(self, count: int) -> Tensor:
-        """Where the target is expected now and in 1 … ``count`` - 1 steps, ``(*B, count, D)``."""
+        """Forecast of the target for now and 1 … ``count`` - 1 steps ahead, ``(*B, count, D)``."""
         ahead = torch.arange(count, device=self.age.device)
         index = (self.age.clamp_min(0).unsqueeze(-1) + ahead).clamp(max=self.path.shape[-2] - 1)
         return self.path.gather(-2, index.unsqueeze(-1).expand(*index.shape, self.path.shape[-1]))
 
     def status(self, trouble: Tensor, replans: Tensor) -> Tensor:
-        """`PlanStatus` of each row, ``(*B,)`` int64, from the code of its input and how many plans it has made."""
+        """`PlanStatus` of each row, ``(*B,)`` int64, from the status of its input and its number of plans."""
         code = torch.where(self.reachable, int(PlanStatus.OK), int(PlanStatus.UNREACHABLE))
         code = torch.where(replans == 0, int(PlanStatus.WAITING), code)
         code = torch.where(self.usable, code, int(PlanStatus.BAD_FORECAST))
@@ -197,9 +197,9 @@ def input_status(observation: Observation, bad: Tensor | None, lost: Lost | None
 
 
 def usable_path(path: Tensor, target_pos: Tensor) -> tuple[Tensor, Tensor]:
-    """The path ``(*B, F, D)``, a target at rest at ``target_pos`` (*B, D) where it is of no use, and its use (*B,).
+    """The path ``(*B, F, D)``, where bad rows rest at ``target_pos`` (*B, D), and which rows are good, ``(*B,)``.
 
-    Whatever forecasts it, the path has the type of the target's position.
+    The path gets the type of the target's position.
     """
     if path.dtype != target_pos.dtype:
         path = path.to(target_pos.dtype)

@@ -42,7 +42,7 @@ class DynamicPlanner(ComposedPlanner):
         obs, found = seen, GOOD
         if not are_sane(tensordict, self.read_besides, *seen[:3], *seen.seen):
             obs, found = judge(seen, tensordict, self.read_by_static, self.memory.names)
-        # Not the clean one: a row that begins without being seen must not remember zeros for its place.
+        # Not the cleaned one: a row that starts with bad input must not store zeros as its position.
         clock, plan, state, pending = self.memory.recall(tensordict, seen, found.spoiled)
         busy = None
         if self.delivery is not None:
@@ -81,7 +81,7 @@ class DynamicPlanner(ComposedPlanner):
         forecast, target_pos = Forecast(path, forecast.spread), observation.target_pos
         eta, planned_steps = eta_model.from_state(observation.robot_state), plan.arrival_steps
         if delay:
-            # From here on, times count from the moment at which the plan becomes available.
+            # From here on, times count from the step at which the plan becomes available.
             forecast, eta = forecast.after(delay), later(eta, delay)
             target_pos, planned_steps = path[..., delay - 1, :], (planned_steps - delay).clamp_min(0)
         context = SearchContext(observation.tool_pos, planned_steps, self.lost, turn)
@@ -91,13 +91,13 @@ class DynamicPlanner(ComposedPlanner):
 
 def turn_after(delay: int, turn: Turn, path: Tensor, observation: Observation) -> Tensor:
     """Orientations (*B, F - delay, 4) along a forecast ``path`` (*B, F, 3), from ``delay`` control steps on."""
-    # What the forecaster reads comes first.
+    # The forecaster's values come first.
     seen = observation.seen[len(observation.seen) - len(turn.in_keys) :]
     return turn(path, observation.target_pos, *seen)[..., delay:, :]
 
 
 def write_goal(tensordict: TensorDictBase, goal: Tensor, arrival_steps: Tensor, *, turned: bool) -> None:
-    """Write a goal (*B, 3 or 2), or the pose (*B, 7) of one that is ``turned``, and when the robot is to be there."""
+    """Write the goal (*B, 3 or 2), or the pose (*B, 7) if it is ``turned``, and the arrival time."""
     if turned:
         tensordict.set(keys.GOAL_POSE, goal)
         goal = goal[..., :3]
@@ -106,10 +106,10 @@ def write_goal(tensordict: TensorDictBase, goal: Tensor, arrival_steps: Tensor, 
 
 
 def observe(tensordict: TensorDictBase, forecaster: ForecastModel, besides: Sequence[Any] = ()) -> Observation:
-    """What a planner with this ``forecaster`` sees; raises `InputError` for a missing key or a wrong shape.
+    """The observation of a planner with this ``forecaster``; raises `InputError` for a missing key or a wrong shape.
 
-    Entries ``besides`` are seen, too, after those that the forecaster reads.
-    Half precision becomes float32, and a step count of any type int64.
+    The keys ``besides`` are read after those of the forecaster. Half precision becomes float32, and a step count of any
+    type int64.
     """
     wanted = (*SEEN_BY_ALL, *forecaster.in_keys, *besides)
     values = [tensordict.get(key, None) for key in wanted]
@@ -122,7 +122,7 @@ def observe(tensordict: TensorDictBase, forecaster: ForecastModel, besides: Sequ
         if size not in POINT_SIZES or target_pos.shape[-1:] != (size,):
             size, other = check_points(keys.TOOL_POS, tool_pos), check_points(keys.TARGET_POS, target_pos)
             raise InputError(
-                f"{keys.TOOL_POS} and {keys.TARGET_POS} must be of as many coordinates, got {size} and {other}"
+                f"{keys.TOOL_POS} and {keys.TARGET_POS} must have equally many coordinates, got {size} and {other}"
             )
         if keys.TARGET_HISTORY in forecaster.in_keys:
             history = seen[forecaster.in_keys.index(keys.TARGET_HISTORY)]
@@ -136,12 +136,12 @@ def observe(tensordict: TensorDictBase, forecaster: ForecastModel, besides: Sequ
 
 
 def are_sane(tensordict: TensorDictBase, read: Sequence[Any], *known: Tensor) -> bool:
-    """Whether what is ``known`` and all entries ``read`` that are there can be looked at, and are numbers of some size.
+    """Whether the tensors ``known`` and the present keys ``read`` can be examined, and are finite and not too large.
 
-    One quick look passes nearly always; `judge` says row by row what is wrong.
+    This quick check nearly always passes; otherwise `judge` finds the bad rows.
     """
     plan = tensordict.get(keys.PLAN, None)
-    # A plain dictionary: a nested look-up takes as long as a small operation.
+    # A plain dictionary: a nested look-up costs as much as a small tensor operation.
     stored = {} if plan is None else dict(plan.items())
     found = [tensordict.get(key, None) if isinstance(key, str) else stored.get(key[-1]) for key in read]
     values = [*known, *(value for value in found if value is not None)]
@@ -166,16 +166,16 @@ def replan_rows(
     """New plans in some rows.
 
     Args:
-        replan: makes a new plan for every row that it is given.
-        rows: ``(*B,)`` bool: those that plan.
+        replan: makes a new plan for every row it is given.
+        rows: ``(*B,)`` bool: rows that plan.
         observation: of this step.
         plan: in use.
         others: plans of the other rows.
-        chunk: rows that ``replan`` is given at once; None for all of them.
+        chunk: rows given to ``replan`` at a time; None for all.
     """
-    # Planning reads no old path: rows are gathered without it.
+    # Planning does not read the old path, so rows are gathered without it.
     bare = plan._replace(path=plan.path[..., :0, :])
-    # Models are given one batch dimension, whatever the planner has.
+    # Models get one batch dimension, however many the planner has.
     plain = chunk is None and rows.ndim == 1 and not torch.compiler.is_compiling() and debug_unwrap(rows) is rows
     if plain and rows.all():
         made = replan(observation, bare)

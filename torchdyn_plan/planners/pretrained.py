@@ -1,4 +1,4 @@
-"""Whole planners in a folder: their parts as JSON, their networks as safetensors, a card to read, nothing pickled."""
+"""Saving and loading whole planners: parts as JSON, networks as safetensors, a model card; nothing is pickled."""
 
 from __future__ import annotations
 
@@ -35,12 +35,12 @@ from torchdyn_plan.versions import library_versions
 FORMAT = "torchdyn_plan.planner.1"
 FILE = "planner.json"
 OWN = "torchdyn_plan."
-"""Classes of modules whose names begin so may be made from a file; others only where the program has imported them."""
+"""Modules with this prefix may be imported for a file; other classes only if the program has imported their module."""
 
 
 @runtime_checkable
 class HasSettings(Protocol):
-    """A part that tells the arguments which make the same part; a frozen dataclass tells them by its fields."""
+    """A part that gives its own constructor arguments; those of a frozen dataclass are its fields."""
 
     def part_settings(self) -> dict[str, Any]:
         """Names and values of the arguments of its constructor."""
@@ -48,10 +48,10 @@ class HasSettings(Protocol):
 
 
 class PretrainedPlanner:
-    """Adds `save_pretrained` and `from_pretrained` to a planner that is made of parts."""
+    """Adds `save_pretrained` and `from_pretrained` to a planner made of parts."""
 
     def prepare(self) -> Self:
-        """Get ready to run once all parts are loaded and frozen; by default nothing is to be done. Returns itself."""
+        """Called once all parts are loaded and frozen; does nothing by default. Returns itself."""
         return self
 
     def save_pretrained(self, folder: str | Path) -> Path:
@@ -60,7 +60,7 @@ class PretrainedPlanner:
         A part that is a plain function cannot be saved: it must be passed again when the planner is loaded.
 
         Returns:
-            The JSON file. Raises `OutputError` where it cannot be written.
+            The JSON file. Raises `OutputError` if it cannot be written.
         """
         folder, written = Path(folder), {}
         with no_empty_folders(folder):
@@ -73,16 +73,15 @@ class PretrainedPlanner:
     def from_pretrained(
         cls, name_or_folder: str | Path, *, device: torch.device | str | None = None, **parts: Any
     ) -> Self:
-        """The planner of a name that ships, ``"TASK-STATIC"`` for the paper's, or in a folder of `save_pretrained`.
+        """Load a shipped planner by name (``"TASK-STATIC"`` for the paper's), or one saved by `save_pretrained`.
 
         Args:
             name_or_folder: the name or the folder.
             device: where its networks go.
-            parts: to take in place of those in the file, by the names of the constructor's arguments.
+            parts: parts that replace those in the file, by the names of the constructor's arguments.
 
         Raises:
-            InputError: there is no such planner, and the message lists those that ship; or a part that was given is of
-                no use.
+            InputError: there is no such planner (the message lists the shipped ones), or a given part is invalid.
             WeightsError: the file is damaged, holds another planner, or lacks a part that was not given.
         """
         file = _find(name_or_folder)
@@ -96,7 +95,7 @@ class PretrainedPlanner:
         made = {name: parts[name] if name in parts else load.part(name, value) for name, value in described.items()}
         try:
             planner: Any = cls(**made)
-            # A part that is not described would be the default one without a word.
+            # A part missing from the file would silently become the default.
             missing = sorted(planner.part_settings().keys() - made.keys())
             if missing:
                 raise WeightsError(f"{str(file)!r} lacks {', '.join(missing)}")
@@ -108,7 +107,7 @@ class PretrainedPlanner:
 
 
 def _save(network: Pretrained, folder: Path, written: dict[int, str]) -> str:
-    """Write ``network`` into ``folder`` unless it was ``written`` already; returns the name of its file."""
+    """Write ``network`` into ``folder`` unless it was already ``written``; returns its file name."""
     if id(network) not in written:
         count = sum(name.startswith(network.kind) for name in written.values())
         name = f"{network.kind}{count + 1 if count else ''}.safetensors"
@@ -123,7 +122,7 @@ def shipped_planners() -> list[str]:
 
 
 def _ready(planner: Any, given: Mapping[str, Any]) -> Any:
-    """``planner``, to run and not to train, but for its parts that were ``given``: those are left as they are."""
+    """``planner`` frozen and in evaluation mode, except for its parts that were ``given``."""
     planner.training = False
     for name, module in planner.named_children():
         if name not in given:
@@ -132,13 +131,13 @@ def _ready(planner: Any, given: Mapping[str, Any]) -> Any:
 
 
 def describe_planner(planner: Any, save: Callable[[Pretrained], str]) -> dict[str, Any]:
-    """``planner`` as JSON; ``save`` stores a network and returns the name of its file."""
+    """``planner`` as JSON; ``save`` stores a network and returns its file name."""
     parts = {name: _describe(value, save) for name, value in planner.part_settings().items()}
     return {"format": FORMAT, "class": _path_of(type(planner)), "parts": parts}
 
 
 def planner_digest(planner: Any) -> str | None:
-    """A few letters that tell planners apart by their parts, settings and tensors; None for a bare function."""
+    """A short digest of a planner's parts, settings and tensors; None for a bare function."""
     if not isinstance(planner, torch.nn.Module):
         return None
     told = hashlib.sha256()
@@ -154,7 +153,7 @@ def planner_digest(planner: Any) -> str | None:
 
 
 def _describe(value: Any, save: Callable[[Pretrained], str]) -> Any:
-    """A part, or a setting of one, as JSON."""
+    """A part, or one of its settings, as JSON."""
     if isinstance(value, (tuple, list)):
         return [_describe(entry, save) for entry in value]
     if isinstance(value, Pretrained):
@@ -168,7 +167,7 @@ def _describe(value: Any, save: Callable[[Pretrained], str]) -> Any:
 
 
 def _describe_value(value: Any) -> Any:
-    """A number, a word or a tensor as JSON, which knows no infinity and no types of torch."""
+    """A number, a string or a tensor as JSON, which has no infinity and no torch types."""
     if isinstance(value, Tensor):
         return {"tensor": value.detach().cpu().tolist(), "dtype": str(value.dtype).removeprefix("torch.")}
     if isinstance(value, torch.dtype):
@@ -179,7 +178,7 @@ def _describe_value(value: Any) -> Any:
 
 
 def _settings_of(value: Any) -> dict[str, Any] | None:
-    """Arguments that make the same part; None if it does not tell them."""
+    """Constructor arguments of a part; None if it does not give them."""
     if isinstance(value, HasSettings):
         return value.part_settings()
     if dataclasses.is_dataclass(value):
@@ -188,13 +187,13 @@ def _settings_of(value: Any) -> dict[str, Any] | None:
 
 
 class _Loader:
-    """Makes parts from what a planner's file says of them."""
+    """Makes parts from their descriptions in a planner's file."""
 
     def __init__(self, file: Path) -> None:
         self.file = file
 
     def part(self, name: str, value: Any) -> Any:
-        """The part ``name``; raises `WeightsError` where it cannot be made."""
+        """The part ``name``; raises `WeightsError` if it cannot be made."""
         try:
             return self.restore(value)
         except (KeyError, TypeError, ValueError, AttributeError, ImportError, RuntimeError, OverflowError) as error:
@@ -203,7 +202,7 @@ class _Loader:
             raise WeightsError(f"{name} of {str(self.file)!r} cannot be made: {error!r}") from error
 
     def restore(self, value: Any) -> Any:
-        """What `_describe` described."""
+        """Inverse of `_describe`."""
         if isinstance(value, list):
             return tuple(self.restore(entry) for entry in value)
         if not isinstance(value, Mapping):
@@ -219,24 +218,24 @@ class _Loader:
 
 
 def _restore_value(value: Mapping[str, Any]) -> Any:
-    """What `_describe_value` described."""
+    """Inverse of `_describe_value`."""
     if "number" in value:
         return float(value["number"])
     dtype = getattr(torch, value["dtype"])
     if not isinstance(dtype, torch.dtype):
-        raise WeightsError(f"torch.{value['dtype']} is no type of numbers")
+        raise WeightsError(f"torch.{value['dtype']} is not a dtype")
     return torch.tensor(value["tensor"], dtype=dtype) if "tensor" in value else dtype
 
 
 def _class_at(path: str, base: type | None) -> Any:
-    """The class at ``module:Name``, which must be a part or a subclass of ``base``; nothing foreign is imported."""
+    """The class at ``module:Name``, which must be a part or a subclass of ``base``; imports no foreign module."""
     module, _, name = path.partition(":")
     if not module.startswith(OWN) and module not in sys.modules:
         raise WeightsError(f"it is a {path}, of a module that is not imported: import {module} first")
     found = getattr(importlib.import_module(module), name)
     is_part = isinstance(found, type) and (dataclasses.is_dataclass(found) or hasattr(found, "part_settings"))
     if not (is_part if base is None else isinstance(found, type) and issubclass(found, base)):
-        raise WeightsError(f"{path} is no part of a planner")
+        raise WeightsError(f"{path} is not a part of a planner")
     return found
 
 
@@ -250,13 +249,15 @@ def _find(name_or_folder: str | Path) -> Path:
         if is_file(choice):
             return choice
     if is_folder(Path(name_or_folder)):
-        raise InputError(f"folder {str(name_or_folder)!r} holds no planner: no {FILE}, as save_pretrained writes it")
+        raise InputError(
+            f"folder {str(name_or_folder)!r} holds no planner: it lacks {FILE}, which save_pretrained writes"
+        )
     check_choice("planner", str(name_or_folder), shipped_planners())
     raise AssertionError("a planner that ships was not found")
 
 
 class _Described(TypedDict):
-    """What is read back of ``planner.json``."""
+    """Content of ``planner.json`` that is read back."""
 
     format: str
     parts: dict[str, Any]

@@ -15,8 +15,8 @@ from torchdyn_plan.errors import InputError
 class StaticPlanner(Protocol):
     """A planner for a target at rest: an `nn.Module` or a plain callable.
 
-    Reads the robot's state and ``goal`` from a tensordict, writes ``action`` and returns the same tensordict. What it
-    has to remember between steps it keeps in that tensordict under ``plan``; rows with ``step_count`` 0 start afresh.
+    Reads the robot's state and ``goal`` from a tensordict, writes ``action`` and returns the same tensordict. Its
+    memory between steps is in that tensordict under ``plan``; rows with ``step_count`` 0 restart.
     """
 
     def __call__(self, tensordict: TensorDictBase, /) -> TensorDictBase:
@@ -25,7 +25,7 @@ class StaticPlanner(Protocol):
 
 
 def read(tensordict: TensorDictBase, key: NestedKey, reader: str) -> Tensor:
-    """Entry ``key`` of ``tensordict``; raises `InputError` if ``reader`` is given a tensordict without it."""
+    """Entry ``key`` of ``tensordict``; raises `InputError`, naming ``reader``, if it is missing."""
     value = tensordict.get(key, None)
     if value is None:
         present = ", ".join(sorted(map(str, tensordict.keys()))) or "none"
@@ -34,7 +34,7 @@ def read(tensordict: TensorDictBase, key: NestedKey, reader: str) -> Tensor:
 
 
 def keys_read(static: TensorDictModuleBase, *others: NestedKey) -> list[Any]:
-    """Keys that a planner built on ``static`` reads: ``others`` and those of ``static`` but the goal, each once."""
+    """Keys that a planner built on ``static`` reads: ``others`` and those of ``static`` except the goal, each once."""
     return list(dict.fromkeys([*others, *(key for key in static.in_keys if key not in (keys.GOAL, keys.GOAL_POSE))]))
 
 

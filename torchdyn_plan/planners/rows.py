@@ -10,7 +10,7 @@ from torchdyn_plan.checks import hides_values
 
 
 def any_row(mask: Tensor) -> bool:
-    """Whether ``mask`` holds anywhere, so that work for none can be left out; always true while compiling."""
+    """Whether ``mask`` is true anywhere, so that work for no rows can be skipped; always true while compiling."""
     return torch.compiler.is_compiling() or bool(debug_unwrap(mask).any())
 
 
@@ -30,17 +30,16 @@ def apply_to_rows(
     """Replace ``outputs`` by ``function(*inputs)`` in the rows where ``mask`` is true; the others keep their values.
 
     Matrix products may differ in the last bit with the number of rows. With ``chunk`` the function always sees exactly
-    that many rows (a row is repeated to fill the last block), so that a row's result depends on that row alone.
-    While compiling and under ``torch.vmap``, where the number of rows must not depend on data, the function sees all of
-    them.
+    that many rows (the last block is padded by repeating a row), so that a row's result depends on that row only. While
+    compiling and under ``torch.vmap``, where the number of rows must not depend on data, the function sees all rows.
 
     Args:
         function: maps tensors with one leading batch dimension, ``(R, …)`` each, to as many tensors as ``outputs``.
-            It is not called when no row is chosen.
+            It is not called if no row is selected.
         mask: ``(*B,)`` bool.
         inputs: what the function reads, ``(*B, …)`` each.
         outputs: old values, ``(*B, …)`` each; left untouched.
-        chunk: rows per call; one call with the chosen rows if None.
+        chunk: rows per call; None for one call with all selected rows.
 
     Returns:
         New tensors of the shapes and types of ``outputs``.

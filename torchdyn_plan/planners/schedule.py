@@ -1,4 +1,4 @@
-"""When to plan again: after a number of steps, or when the last plan no longer fits the observation."""
+"""Re-plan schedules: after a number of steps, or when the plan in use no longer fits the observation."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ class Clock(NamedTuple):
     countdown: Tensor
     """Steps from now to the next plan."""
     replans: Tensor
-    """Plans begun since the reset."""
+    """Plans started since the reset."""
 
     def older(self) -> Clock:
         """The clock one control step later."""
@@ -39,14 +39,14 @@ class Clock(NamedTuple):
 
     @classmethod
     def until(cls, first_step: int, window: int, step_count: Tensor) -> Clock:
-        """Clock of episodes that are at ``step_count`` (*B,) and plan first at ``first_step``."""
+        """Clock of episodes at ``step_count`` (*B,) whose first plan is at ``first_step``."""
         countdown = (first_step - step_count).clamp_min(0)
         return cls(torch.full_like(step_count, window), countdown, torch.zeros_like(step_count))
 
     def retry(self, failed: Tensor, before: Clock) -> Clock:
-        """The clock, but rows that ``failed`` (*B,) to plan are due again at the next step.
+        """The clock with rows that ``failed`` (*B,) to plan due again at the next step.
 
-        ``before`` is the clock before they were due: a plan that failed does not count, and moves no window.
+        ``before`` is the clock before they were due: a failed plan is not counted and does not shrink the window.
         """
         return Clock(
             torch.where(failed, before.window, self.window),
@@ -56,14 +56,14 @@ class Clock(NamedTuple):
 
 
 Late = Callable[[Tensor], Tensor]
-"""Measures how late robots are, `lateness`, in the rows of a mask ``(*B,)``: ``(*B,)`` [control steps]."""
+"""`lateness` of the robots in the rows of a mask ``(*B,)``: ``(*B,)`` [control steps]."""
 
 
 class Schedule(Protocol):
-    """What tells a planner which rows plan now; its state is a `Clock`."""
+    """Decides which rows plan now; its state is a `Clock`."""
 
     watches: ClassVar[bool]
-    """Whether it looks at the plan's path between plans, which is then remembered."""
+    """Whether it reads the plan's path between plans, which is then kept in the memory."""
 
     @property
     def longest(self) -> int:
@@ -77,27 +77,27 @@ class Schedule(Protocol):
     def tick(
         self, clock: Clock, observation: Observation, plan: Plan, /, *, busy: Tensor | None, late: Late
     ) -> tuple[Clock, Tensor]:
-        """Say which rows plan now.
+        """Decide which rows plan now.
 
         Args:
             clock: of this step.
             observation: of this step.
             plan: in use.
-            busy: ``(*B,)`` bool: a plan is under way, and no other can begin; None for nowhere.
+            busy: ``(*B,)`` bool: a plan is under way and no other can start; None if no row is busy.
             late: measures how late the robot is.
 
         Returns:
-            The clock after this step's plans, and ``(*B,)`` bool: true where a plan begins now.
+            The clock after this step's plans, and ``(*B,)`` bool: true where a plan starts now.
         """
         ...
 
 
 @dataclass(frozen=True, kw_only=True)
 class ReplanSchedule:
-    """The paper's schedule, t_TTR = max(γ t_TTR, 25) (Section III-B.4), in whole steps; or `every` few steps.
+    """The paper's schedule, t_TTR = max(γ t_TTR, 25) (Section III-B.4), in whole steps; or a fixed period, `every`.
 
     The window is shrunk before its first use, so that the paper's values plan at steps 13, 80, 140, 194, …
-    A row that is busy when its plan is due lets a window of the same length go by.
+    A row that is busy when its plan is due waits for another window of the same length.
     """
 
     watches: ClassVar[bool] = False
@@ -107,7 +107,7 @@ class ReplanSchedule:
     window: int = 75
     """Window before it is first shrunk [control steps]."""
     shrink: float = 0.9
-    """γ, by which every plan multiplies the window."""
+    """γ, the factor applied to the window at every plan."""
     minimum: int = 25
     """The window never falls below this [control steps]."""
 
@@ -119,15 +119,15 @@ class ReplanSchedule:
 
     @classmethod
     def every(cls, steps: int, *, first_step: int = 1) -> ReplanSchedule:
-        """A plan at ``first_step`` and every ``steps`` from then on; at step 1 a target has been seen to move."""
+        """A plan at ``first_step`` and every ``steps`` after it; at step 1 two positions of the target are known."""
         check_number("steps", steps, minimum=1, integer=True)
         return cls(first_step=first_step, window=steps, shrink=1.0, minimum=steps)
 
     @classmethod
     def every_seconds(cls, seconds: float, *, control_step: float, first: float | None = None) -> ReplanSchedule:
-        """A plan every ``seconds``, and the first one ``first`` [s] after the reset; after a step for None.
+        """A plan every ``seconds``, the first one ``first`` [s] after the reset, or after one step for None.
 
-        Times are whole control steps of ``control_step`` [s], rounded up.
+        Times are rounded up to whole control steps of ``control_step`` [s].
         """
         first_step = 1 if first is None else steps_in("first", first, control_step)
         return cls.every(max(steps_in("seconds", seconds, control_step), 1), first_step=first_step)
@@ -138,7 +138,7 @@ class ReplanSchedule:
         return int(self.next_window(torch.tensor(self.window)))
 
     def next_window(self, window: Tensor) -> Tensor:
-        """max(⌊γ·window⌋, minimum) of int64 ``(*B,)``, exact: γ is taken as the decimal fraction that it is written."""
+        """max(⌊γ·window⌋, minimum) of int64 ``(*B,)``, exact: γ is read as the decimal fraction it is written as."""
         ratio = Fraction(str(self.shrink))
         shrunk = torch.div(window * ratio.numerator, ratio.denominator, rounding_mode="floor")
         return shrunk.clamp_min(self.minimum)
@@ -150,7 +150,7 @@ class ReplanSchedule:
     def tick(
         self, clock: Clock, observation: Observation, plan: Plan, *, busy: Tensor | None, late: Late
     ) -> tuple[Clock, Tensor]:
-        """Which rows plan now, as `Schedule.tick` says; the plan itself does not matter."""
+        """Which rows plan now, see `Schedule.tick`; the plan is not read."""
         over = clock.countdown <= 0
         if not (torch.compiler.is_compiling() or debug_unwrap(over).any()):
             return clock, over
@@ -161,10 +161,10 @@ class ReplanSchedule:
 
 @dataclass(frozen=True, kw_only=True)
 class EventSchedule:
-    """Plans again when the last plan no longer fits: the target left its forecast, the robot is late, or time is over.
+    """Plans again when the target has left its forecast, the robot is late, or the longest time is over.
 
-    It looks every few steps, so that times between plans are multiples of them and `ExactSearch` finds its candidates
-    on the same places of the path. A row that is busy then plans at the next look.
+    It checks every few steps, so that times between plans are multiples of ``every`` and `ExactSearch` finds its
+    candidates at the same points of the path. A row that is busy plans at the next check.
     """
 
     watches: ClassVar[bool] = True
@@ -172,15 +172,15 @@ class EventSchedule:
     first_step: int = 13
     """Control step of the first plan, counted from the reset."""
     every: int = 5
-    """Control steps between two looks; for `ExactSearch` a multiple of its stride."""
+    """Control steps between two checks; for `ExactSearch` a multiple of its stride."""
     minimum: int = 5
     """Shortest time between two plans [control steps]."""
     maximum: int = 50
     """Longest time between two plans [control steps]."""
     miss: float = 0.003
-    """Greatest distance of the target from its forecast [m]."""
+    """Largest distance of the target from its forecast [m]."""
     late: float = 5.0
-    """Control steps that the robot may come later than planned."""
+    """Control steps by which the robot may be later than planned."""
 
     def __post_init__(self) -> None:
         check_number("first_step", self.first_step, minimum=0, integer=True)
@@ -205,9 +205,9 @@ class EventSchedule:
     def tick(
         self, clock: Clock, observation: Observation, plan: Plan, *, busy: Tensor | None, late: Late
     ) -> tuple[Clock, Tensor]:
-        """Which rows plan now, as `Schedule.tick` says.
+        """Which rows plan now, see `Schedule.tick`.
 
-        The clock's countdown runs to the latest next plan, and below 0 where a busy row is overdue.
+        The clock's countdown runs to the latest possible next plan, and below 0 in busy rows that are overdue.
         """
         window, countdown, replans = clock
         passed = window - countdown
@@ -224,7 +224,7 @@ class EventSchedule:
 
 
 def starting_at(schedule: Schedule, first_step: int) -> Schedule:
-    """``schedule`` with its first plan at ``first_step``; as it is where it does not tell when it plans first."""
+    """``schedule`` with its first plan at ``first_step``; unchanged if it has no ``first_step``."""
     settings: Any = schedule
     named = dataclasses.is_dataclass(schedule) and any(
         field.name == "first_step" for field in dataclasses.fields(schedule)
@@ -233,10 +233,10 @@ def starting_at(schedule: Schedule, first_step: int) -> Schedule:
 
 
 def lateness(eta: ArrivalModel, observation: Observation, plan: Plan, chunk: int | None, rows: Tensor) -> Tensor:
-    """How late robots are by their plan [control steps], ``(*B,)``: predicted time to the goal less the planned one.
+    """Predicted minus planned time to the goal [control steps], ``(*B,)``: how late the robots are.
 
-    Infinite where a robot never arrives; values outside of ``rows`` (*B,) bool mean nothing. ``eta`` sees ``chunk``
-    rows at once.
+    Infinite where a robot never arrives; values outside ``rows`` (*B,) bool are meaningless. ``eta`` is given ``chunk``
+    rows at a time.
     """
 
     def measure(robot_state: Tensor, goal: Tensor, planned_steps: Tensor) -> tuple[Tensor]:

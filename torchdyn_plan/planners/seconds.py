@@ -1,4 +1,4 @@
-"""Times as people speak of them, in seconds, as the control steps that planners count."""
+"""Conversion of times in seconds to control steps."""
 
 from __future__ import annotations
 
@@ -7,11 +7,11 @@ import math
 from torchdyn_plan.checks import check_number
 
 ROUNDING = 1e-6
-"""Share of a control step that is rounding."""
+"""Share of a control step treated as rounding error."""
 
 
 def steps_in(name: str, seconds: float, control_step: float) -> int:
-    """Fewest control steps of ``control_step`` [s] that take the time ``name`` of ``seconds`` [s].
+    """Smallest number of control steps of ``control_step`` [s] that cover ``seconds`` [s]; ``name`` is for errors.
 
     Raises:
         InputError: a time is no number, is negative, or ``control_step`` is not positive.

@@ -1,7 +1,7 @@
-"""What lies between a camera and a planner: measurements at any time, of any quality, become a motion that is known.
+"""Tracking filters: they turn measurements of any rate and quality into an estimate of the target's motion.
 
-Time is in seconds since the reset, on the clock of the measurements. A track is a plain set of numbers, and all that it
-remembers is a `TrackState` of tensors, which whoever uses it stores from step to step.
+Time is in seconds since the reset, on the clock of the measurements. A `Track` holds settings only; its memory is a
+`TrackState` of tensors, which the caller stores from step to step.
 """
 
 from __future__ import annotations
@@ -22,31 +22,31 @@ from torchdyn_plan.checks import POINT_SIZES, check_number, check_trailing_shape
 from torchdyn_plan.planners.rows import where_rows
 
 LARGEST = 1e6
-"""No place that is measured is farther from the origin [m], and no moment from the reset [s]."""
+"""Measurements farther from the origin [m], or with a larger time stamp [s], are rejected."""
 CLOCKS = 1e-4
-"""A measurement may come this much from the future: clocks round [s]."""
+"""A time stamp may lie this far in the future, because clocks round [s]."""
 
 
 class TrackState(NamedTuple):
-    """What is known of each target: position, velocity and, for n = 3, acceleration, alike along all D axes."""
+    """Estimate of each target's motion: position, velocity and, for n = 3, acceleration along D axes."""
 
     motion: Tensor
-    """``(*B, Dn + n(n+1)/2)`` at ``time``: position, velocity … [m, m/s, m/s²; world], then the covariance of each axis
-    alone, the same for all, the upper triangle row by row."""
+    """``(*B, Dn + n(n+1)/2)`` at ``time``: position, velocity … [m, m/s, m/s²; world], then the upper triangle, row by
+    row, of the covariance along one axis; it is the same for every axis."""
     time: Tensor
-    """``(*B,)`` moment of the newest measurement that was used, -inf for none [s]."""
+    """``(*B,)`` time of the newest measurement used, -inf for none [s]."""
     begin: Tensor
-    """``(*B,)`` moment of the first measurement [s]."""
+    """``(*B,)`` time of the first measurement [s]."""
     since: Tensor
-    """``(*B,)`` moment from which on the target moves as it does: the first measurement, or that after a bounce [s]."""
+    """``(*B,)`` start of the current motion: the first measurement, or the first one after a bounce [s]."""
     before: Tensor
-    """``(*B, 2D)`` position and velocity at ``since`` by the motion before the bounce [m, m/s]."""
+    """``(*B, 2D)`` position and velocity at ``since``, extrapolated from the motion before the bounce [m, m/s]."""
     used: Tensor
-    """``(*B,)`` int64 measurements that were used."""
+    """``(*B,)`` int64 number of measurements used."""
     restarts: Tensor
-    """``(*B,)`` int64 of these that did not fit the motion before, and began another: bounces, mostly."""
+    """``(*B,)`` int64 number of measurements that did not fit and restarted the motion: mostly bounces."""
     rejected: Tensor
-    """``(*B,)`` int64 measurements that were of no use: no numbers, from the future, too old, or too far away."""
+    """``(*B,)`` int64 number of measurements rejected: NaN, from the future, too old, or too far away."""
 
     @property
     def pos(self) -> Tensor:
@@ -67,13 +67,14 @@ class TrackState(NamedTuple):
         return torch.stack([own[..., :2], torch.stack([own[..., 1], own[..., n]], dim=-1)], dim=-2)
 
     def path(self, time: Tensor) -> Tensor:
-        """Positions ``(*B, T, D)`` at moments ``time`` (*B, T) [s]: before a bounce by the motion of then [m, world].
+        """Positions ``(*B, T, D)`` [m, world] at times ``time`` (*B, T) [s].
 
-        Before the first measurement the target rests where the motion begins.
+        Times before the last bounce use the motion before it. Before the first measurement the target is taken to rest
+        at its first position.
         """
         time = torch.maximum(time, self.begin.unsqueeze(-1))
         since, (coordinates, n) = self.since.unsqueeze(-1), _sizes(self.motion)
-        # Of rows of which nothing is known the time is infinite.
+        # Rows without a measurement have time -inf.
         passed = time - self.time.clamp_min(-LARGEST).unsqueeze(-1)
         now = _polynomial(self.motion[..., : coordinates * n], passed, coordinates)
         earlier = time < since
@@ -83,59 +84,59 @@ class TrackState(NamedTuple):
 
 
 class Measurement(NamedTuple):
-    """A measurement in each row."""
+    """One measurement in each row."""
 
     time: Tensor
-    """``(*B,)`` when it was taken; NaN for none [s]."""
+    """``(*B,)`` time stamp, NaN for no measurement [s]."""
     pos: Tensor
     """``(*B, D)`` [m, world]."""
     variance: Tensor | float
-    """``(*B,)`` of its error along each axis [m²]."""
+    """``(*B,)`` variance of its error along each axis [m²]."""
 
 
 class Prediction(NamedTuple):
-    """What is expected of a measurement in each row. Components come first: ``(D, *B)``, and ``(1, *B)`` for one."""
+    """The filter's prediction of a measurement in each row. Components come first: ``(D, *B)``, or ``(1, *B)``."""
 
     mean: list[Tensor]
-    """n of ``(D, *B)``: the motion at the moment of the newest measurement, this one included."""
+    """n of ``(D, *B)``: the motion at the time of the newest measurement, this one included."""
     covariance: list[list[Tensor]]
     """The rows of its upper triangle, ``(1, *B)`` each."""
     passed: Tensor
-    """``(*B,)`` since the newest measurement before this one [s]; negative if this one is late."""
+    """``(*B,)`` time since the newest earlier measurement [s]; negative if this one is out of order."""
     lever: list[Tensor]
-    """n of ``(1, *B)``: covariance of the motion with the position that was measured."""
+    """n of ``(1, *B)``: covariance of the motion with the measured position."""
     innovation: Tensor
-    """``(D, *B)`` what was measured less what was expected [m]."""
+    """``(D, *B)`` measured minus predicted position [m]."""
     variance: Tensor
     """``(1, *B)`` of the innovation along each axis [m²]."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class Track(ABC):
-    """Follows one target in each row by a linear filter.
+    """Follows one target in each row with a linear filter.
 
-    A measurement that does not fit begins the motion anew: the target has bounced, and some of its speed comes back.
-    One that is no number, is from the future, too old or so far off that the target would have had to fly there is not
-    used. One that is late or out of order is used for what it says of the present, less sure for what may have happened
-    since; several may be of one moment.
+    A measurement outside the gate restarts the motion: the target has bounced, and part of its speed is reversed.
+    A measurement is rejected if it is NaN, from the future, too old, or farther away than the target can have moved.
+    A late or out-of-order measurement updates the present state, with variance added for the time since it was taken.
+    Several measurements may have the same time stamp.
     """
 
     noise: float = 0.001
-    """Standard deviation of a measurement's error along each axis, where a measurement does not bring its own [m]."""
+    """Standard deviation of a measurement's error along each axis, unless the measurement comes with its own [m]."""
     speed: float = 3.0
-    """Standard deviation of the speed along each axis of a target of which nothing is known [m/s]."""
+    """Prior standard deviation of the velocity along each axis [m/s]."""
     max_speed: float = 20.0
-    """No target moves faster [m/s]."""
+    """Largest speed of a target [m/s]."""
     gate: float = 5.0
-    """A measurement fits up to so many standard deviations of what is expected of it."""
+    """A measurement fits if it is within this many standard deviations of its prediction."""
     rebound: float = 0.9
-    """Share of the speed that is taken to come back from a bounce, along the axes in which it shows."""
+    """Share of the speed assumed to be reversed by a bounce, along the axes in which the measurement does not fit."""
     patience: float = 0.2
-    """So long a track is of use without a measurement [s]."""
+    """A track stays usable this long without a measurement [s]."""
     least: int = 2
-    """Measurements from which on a track is of use."""
+    """Number of measurements that make a track usable."""
     oldest: float = 0.5
-    """A measurement older than the newest one by more than this is not used [s]."""
+    """A measurement older than the newest one by more than this is rejected [s]."""
 
     def __post_init__(self) -> None:
         check_number("noise", self.noise, minimum=1e-6)
@@ -145,7 +146,7 @@ class Track(ABC):
         check_number("least", self.least, minimum=1, integer=True)
 
     def told(self) -> dict[str, Any]:
-        """Its kind, and every number by name, for files."""
+        """Its kind and settings by name, to be stored in files."""
         return {"kind": type(self).__name__} | dataclasses.asdict(self)
 
     @property
@@ -155,17 +156,17 @@ class Track(ABC):
 
     @property
     def forgets(self) -> float:
-        """Rate at which the past counts less, whatever is measured [1/s]."""
+        """Rate at which past measurements are forgotten [1/s]."""
         return 0.0
 
     @property
     @abstractmethod
     def wander(self) -> float:
-        """Spectral density of what changes the last of the n derivatives."""
+        """Spectral density of the process noise, which acts on the last of the n derivatives."""
 
     @cached_property
     def _drift(self) -> tuple[tuple[int, int, int, float], ...]:
-        """What noise adds to entry (i, j) of the covariance in t seconds: power of t, and factor."""
+        """Process noise: entries (i, j, power, factor), each adding factor t^power to the covariance in t seconds."""
         n, found = self.order, []
         # White noise of spectral density q on the last derivative (Bar-Shalom et al., Estimation, 6.2):
         # Q_ij = q t^(2n-1-i-j) / ((n-1-i)! (n-1-j)! (2n-1-i-j)).
@@ -176,7 +177,7 @@ class Track(ABC):
         return tuple(found)
 
     def start(self, like: Tensor) -> TrackState:
-        """The state of rows of which nothing is known, in the batch, type and device of ``like`` (*B, D)."""
+        """The state before any measurement, with the batch, type and device of ``like`` (*B, D)."""
         *batch, coordinates = like.shape
         n = self.order
         none = torch.zeros(batch, dtype=torch.int64, device=like.device)
@@ -189,14 +190,14 @@ class Track(ABC):
     def add(
         self, state: TrackState, time: Tensor, pos: Tensor, now: Tensor, *, variance: Tensor | float | None = None
     ) -> TrackState:
-        """The state after one measurement in each row, or none where its time is NaN; differentiable.
+        """The state after one measurement in each row; rows with time NaN have none. Differentiable.
 
         Args:
-            state: before.
-            time: ``(*B,)`` when it was taken [s].
+            state: the state before it.
+            time: ``(*B,)`` time stamp [s].
             pos: ``(*B, D)`` [m, world].
-            now: ``(*B,)`` the present [s].
-            variance: ``(*B,)`` of its error along each axis [m²]; the square of ``noise`` for None.
+            now: ``(*B,)`` current time [s].
+            variance: ``(*B,)`` variance of its error along each axis [m²]; the square of ``noise`` for None.
 
         Raises:
             InputError: a shape is wrong.
@@ -206,7 +207,7 @@ class Track(ABC):
             check_trailing_shape("time of a measurement", time, *state.time.shape)
             check_trailing_shape("pos of a measurement", pos, *state.time.shape, coordinates)
         looks = not hides_values(time)
-        # A camera is slower than the loop: at most steps nothing comes.
+        # A camera is slower than the control loop: most steps bring no measurement.
         if looks and _is_nothing(debug_unwrap(time)):
             return state
         measured = Measurement(time, pos, self.noise**2 if variance is None else variance)
@@ -216,24 +217,24 @@ class Track(ABC):
                 return self._used(state, expected, time)
             return self._sorted(state, measured, now, self._fit(expected).all(0))
         expected = self._expect(state, measured)
-        # A comparison with what is no number, or with a row of which nothing is known, is false.
+        # Comparisons with NaN, and in rows without a measurement, are false.
         fits = (self._fit(expected).all(0) & (expected.passed >= -self.oldest)) & (time <= now + CLOCKS)
         if not hides_values(fits) and debug_unwrap(fits).all():
             return self._used(state, expected, torch.maximum(state.time, time))
         return self._sorted(state, measured, now, fits)
 
     def at(self, state: TrackState, now: Tensor) -> TrackState:
-        """The state brought forward to ``now`` (*B,) [s], without a measurement: where the target is by now."""
+        """The state predicted to ``now`` (*B,) [s], without a measurement."""
         now = torch.maximum(now, state.time)
         passed = torch.where(state.used > 0, now - state.time, 0.0)
         return state._replace(motion=_packed(*self._ahead(state, passed)), time=now)
 
     def usable(self, state: TrackState, now: Tensor) -> Tensor:
-        """Whether there is a track to go by ``now`` (*B,) [s]: ``(*B,)`` bool."""
+        """``(*B,)`` bool: whether the track can be used at time ``now`` (*B,) [s]."""
         return (state.used >= self.least) & (now - state.time <= self.patience)
 
     def _expect_next(self, state: TrackState, measured: Measurement) -> Prediction:
-        """`_expect` where no row's measurement is late: the same in fewer operations, and most often all that is."""
+        """`_expect` for the common case that no row's measurement is late: fewer operations, the same result."""
         passed = measured.time - state.time
         mean, covariance = self._ahead(state, passed)
         innovation = measured.pos.movedim(-1, 0) - mean[0]
@@ -241,13 +242,13 @@ class Track(ABC):
         return Prediction(mean, covariance, passed, covariance[0], innovation, variance)
 
     def _ahead(self, state: TrackState, passed: Tensor) -> tuple[list[Tensor], list[list[Tensor]]]:
-        """Mean and covariance ``passed`` (*B,) seconds after the state, not before it."""
+        """Mean and covariance ``passed`` (*B,) seconds after the state; ``passed`` is not negative."""
         mean, covariance = _unpacked(state.motion)
         forward = _factors(passed, self.order)
         return [_sum(mean[i:], forward) for i in range(self.order)], self._spread(covariance, passed)
 
     def _expect(self, state: TrackState, measured: Measurement) -> Prediction:
-        """What is expected in place of what was measured."""
+        """The prediction of a measurement, which may be late."""
         mean, covariance = _unpacked(state.motion)
         passed = measured.time - state.time
         ahead = passed.clamp_min(0.0)
@@ -258,7 +259,7 @@ class Track(ABC):
         innovation = measured.pos.movedim(-1, 0) - _sum(mean, _factors(passed, self.order))
         scale = _sum(lever, late) + measured.variance
         if self._drift:
-            # What may have happened since a late measurement was taken makes it less sure.
+            # Process noise since a late measurement was taken adds to its variance.
             _, _, power, factor = self._drift[0]
             scale = torch.add(scale, _power(-behind, power), alpha=factor)
         forward = _factors(ahead, self.order)
@@ -266,7 +267,7 @@ class Track(ABC):
         return Prediction(mean, covariance, passed, lever, innovation, scale)
 
     def _spread(self, covariance: list[list[Tensor]], ahead: Tensor) -> list[list[Tensor]]:
-        """The covariance ``ahead`` (*B,) seconds later: F P Fᵀ + Q, with F that of n integrators in a row."""
+        """The covariance ``ahead`` (*B,) seconds later: F P Fᵀ + Q, with F of a chain of n integrators."""
         n, forward = self.order, _factors(ahead, self.order)
         whole = _whole(covariance)
         half = [[_sum([whole[k][j] for k in range(i, n)], forward) for j in range(i, n)] for i in range(n)]
@@ -283,11 +284,11 @@ class Track(ABC):
         return found
 
     def _fit(self, expected: Prediction) -> Tensor:
-        """Whether a measurement is where it was expected, along each axis ``(D, *B)`` bool."""
+        """``(D, *B)`` bool: whether the measurement is within the gate, along each axis."""
         return expected.innovation.square() <= self.gate**2 * expected.variance
 
     def _used(self, state: TrackState, expected: Prediction, newest: Tensor) -> TrackState:
-        """The state at ``newest`` (*B,) [s] after measurements that fit in all rows: the Kalman filter's correction."""
+        """The Kalman filter's update, for measurements that fit in all rows; the state is at ``newest`` (*B,) [s]."""
         lever, n = expected.lever, self.order
         gain = [entry / expected.variance for entry in lever]
         mean = [torch.addcmul(expected.mean[i], gain[i], expected.innovation) for i in range(n)]
@@ -298,12 +299,12 @@ class Track(ABC):
         return state._replace(motion=_packed(mean, covariance), time=newest, used=state.used + 1)
 
     def _sorted(self, state: TrackState, measured: Measurement, now: Tensor, fits: Tensor) -> TrackState:
-        """`add` where rows differ: in some the motion begins, in some there is no measurement, or a useless one."""
+        """`add` where rows differ: in some the motion restarts, in others the measurement is missing or rejected."""
         time, pos, _ = measured
         given, known = ~time.isnan(), state.used > 0
         usable = (pos.abs().amax(-1) <= LARGEST) & (time <= now + CLOCKS) & (time.abs() <= LARGEST)
         usable = usable & ~(time < state.time - self.oldest)
-        # What is no number must not reach what is computed of rows that do not use it: gradients would see it.
+        # NaN must not enter the computation of unused rows either: it would reach the gradients.
         last = torch.where(known, state.time, 0.0)
         measured = measured._replace(time=torch.where(usable, time, last), pos=where_rows(usable, pos, state.pos))
         state = state._replace(time=last)
@@ -322,9 +323,9 @@ class Track(ABC):
         )
 
     def _begun(self, state: TrackState, expected: Prediction, measured: Measurement, lost: Tensor) -> TrackState:
-        """The state where a motion begins with a measurement, after a bounce or, in rows ``lost`` (*B,), from nothing.
+        """The state where a measurement starts a motion: after a bounce or, in rows ``lost`` (*B,), from the prior.
 
-        What bounced has turned round along the axes in which the measurement does not fit.
+        A bounce reverses the velocity along the axes in which the measurement does not fit.
         """
         time, pos, variance = measured
         where, velocity = pos.movedim(-1, 0), expected.mean[1]
@@ -343,28 +344,28 @@ class Track(ABC):
         )
 
     def _unsure(self, like: Tensor, variance: Tensor | float) -> list[list[Tensor]]:
-        """Covariance where a position with ``variance`` (*B,) is known, and nothing else; for ``like`` (*B,)."""
+        """Prior covariance with a position of ``variance`` (*B,) known; batch and type of ``like`` (*B,)."""
         zero = torch.zeros_like(like).unsqueeze(0)
         spreads = [zero + variance, *(zero + deviation**2 for deviation in self._unknown)]
         return [[spreads[i], *[zero] * (self.order - 1 - i)] for i in range(self.order)]
 
     @property
     def _unknown(self) -> list[float]:
-        """Standard deviations of velocity and further derivatives of which nothing is known."""
+        """Prior standard deviations of the velocity and further derivatives."""
         return [self.speed]
 
 
 @dataclass(frozen=True, kw_only=True)
 class KalmanTrack(Track):
-    """The Kalman filter of a target that moves at constant velocity, or acceleration, but for what accelerates it."""
+    """Kalman filter with a constant-velocity or constant-acceleration model and white process noise."""
 
     agility: float = 0.1
-    """After t seconds without a measurement the last derivative may have changed by ``agility``·√t: root of the
-    spectral density of what changes it [m/s² per √Hz; with ``accelerates`` m/s³]."""
+    """Square root of the spectral density of the process noise: in t seconds the last derivative drifts by
+    ``agility``·√t [m/s² per √Hz; with ``accelerates`` m/s³]."""
     accelerates: bool = False
-    """Whether the acceleration is constant, and not the velocity."""
+    """Whether the model is constant acceleration rather than constant velocity."""
     acceleration: float = 1.0
-    """Standard deviation of the acceleration of a target of which nothing is known [m/s²]; with ``accelerates``."""
+    """Prior standard deviation of the acceleration, with ``accelerates`` [m/s²]."""
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -388,10 +389,10 @@ class KalmanTrack(Track):
 
 @dataclass(frozen=True, kw_only=True)
 class LeastSquaresTrack(Track):
-    """A straight line by least squares through the measurements, of which older ones count less: as e^(-age/window)."""
+    """A straight line fitted to the measurements by least squares, weighted by e^(-age/window)."""
 
     window: float = 0.1
-    """Time over which a measurement's weight falls to 1/e [s]."""
+    """Time in which a measurement's weight falls to 1/e [s]."""
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -409,22 +410,22 @@ class LeastSquaresTrack(Track):
 
 
 def _is_nothing(time: Tensor) -> bool:
-    """Whether no row has a measurement, by their times (*B,)."""
+    """Whether no row has a measurement, from their times (*B,)."""
     if time.numel() != 1:
         return bool(time.isnan().all())
-    # A number of Python's own takes less time to compare than a tensor.
+    # Comparing a Python number is cheaper than comparing a tensor.
     return math.isnan(time.item())
 
 
 def _is_in_order(before: Tensor, time: Tensor, now: Tensor) -> bool:
-    """Whether every row has a measurement, not from ``before`` (*B,) that row's newest one, nor from the future."""
+    """Whether every row has a measurement, none older than the row's newest (``before`` (*B,)) or from the future."""
     if time.numel() != 1:
         return bool(((time >= before) & (time <= now + CLOCKS)).all())
     return before.item() <= time.item() <= now.item() + CLOCKS
 
 
 SIZES = {d * n + n * (n + 1) // 2: (d, n) for d in POINT_SIZES for n in (2, 3)}
-"""Coordinates D and order n by the numbers of a motion, Dn + n(n+1)/2: no two have as many."""
+"""Coordinates D and order n by the length of a motion, Dn + n(n+1)/2, which is unique."""
 
 
 def _sizes(motion: Tensor) -> tuple[int, int]:
@@ -444,18 +445,18 @@ def _unpacked(motion: Tensor) -> tuple[list[Tensor], list[list[Tensor]]]:
 
 
 def _packed(mean: list[Tensor], covariance: list[list[Tensor]]) -> Tensor:
-    """The motion ``(*B, Dn + n(n+1)/2)``; in memory its components come first, which makes them cheap to take apart."""
+    """The motion ``(*B, Dn + n(n+1)/2)``; components come first in memory, which makes them cheap to take apart."""
     return torch.cat([*mean, *(entry for row in covariance for entry in row)]).movedim(0, -1)
 
 
 def _whole(triangle: list[list[Tensor]]) -> list[list[Tensor]]:
-    """The rows of a symmetric matrix of which the upper triangle is given."""
+    """The rows of a symmetric matrix, from its upper triangle."""
     n = len(triangle)
     return [[triangle[min(i, j)][abs(i - j)] for j in range(n)] for i in range(n)]
 
 
 def _factors(time: Tensor, n: int) -> list[Tensor]:
-    """t, t²/2 … of ``time``, n - 1 of them: what the derivatives add meanwhile."""
+    """t, t²/2 … of ``time``, n - 1 terms of the Taylor series."""
     found = [time]
     while len(found) < n - 1:
         found.append(found[-1] * time / (len(found) + 1))
@@ -471,7 +472,7 @@ def _sum(terms: Sequence[Tensor], factors: list[Tensor]) -> Tensor:
 
 
 def _power(value: Tensor, exponent: int) -> Tensor:
-    """``value`` multiplied by itself: cheaper than a power, and its derivative at 0 is a number."""
+    """``value`` to an integer power by multiplication: cheaper than ``pow``, and its derivative at 0 is finite."""
     found = value
     for _ in range(exponent - 1):
         found = found * value
@@ -479,7 +480,7 @@ def _power(value: Tensor, exponent: int) -> Tensor:
 
 
 def _with_power(value: Tensor, powers: list[Tensor], power: int, factor: float) -> Tensor:
-    """``value`` + ``factor`` t^``power``, from the ``powers`` t, t² … of which two make it."""
+    """``value`` + ``factor`` t^``power``; t^``power`` is the product of two of the ``powers`` (t, t² …)."""
     if power == 1:
         return torch.add(value, powers[0], alpha=factor)
     half = power // 2

@@ -1,4 +1,4 @@
-"""A planner that sees its target through measurements: at any rate, late, noisy, with gaps."""
+"""A planner that sees its target through measurements: noisy, late, at any rate, with gaps."""
 
 from __future__ import annotations
 
@@ -22,26 +22,26 @@ from torchdyn_plan.planners.rows import where_rows
 from torchdyn_plan.planners.track import Track, TrackState
 
 NAMES = tuple(f"track_{field}" for field in TrackState._fields)
-"""What it remembers below ``plan``."""
+"""Names of its memory under ``plan``."""
 AGE, DEVIATION = "track_age", "track_deviation"
-"""Written beside, for people to read: how old the newest measurement is [s], and how far the target may be from where
-it is taken to be: standard deviation along each axis [m]."""
+"""Also written, for diagnosis: the age of the newest measurement [s], and the standard deviation of the target's
+estimated position along each axis [m]."""
 ANY_HISTORY = 24
-"""Positions of a target's history for planners that read any number of them."""
+"""Length of the target's history for planners that accept any length."""
 SHOWN = (keys.TARGET_POS, keys.TARGET_HISTORY, keys.TARGET_COVARIANCE)
-"""What the planner inside is shown in place of what the tensordict holds."""
+"""Keys that the inner planner sees from the track instead of from the tensordict."""
 
 
 class TrackedPlanner(PretrainedPlanner, Remembering):
-    """Puts a `Track` between the measurements and a planner; it writes the planner's ``target_pos`` and history.
+    """Puts a `Track` between the measurements and a planner, and provides the planner's ``target_pos`` and history.
 
-    Reads ``measured_pos`` (*B, M, D) and ``measured_time`` (*B, M), up to M measurements that have come since the last
-    step; where they are absent, ``target_pos`` is one of now. The planner sees where the target is now by the track,
-    its past at each control step, and the covariance of the two; afterwards these entries are as they were. Rows
-    without a usable track are `PlanStatus.NO_TRACK`: they hold still until there is one. A planner that has a second
-    forecaster for targets that are measured with noise, `torchdyn_plan.nets.ForecastByNoise`, uses the one for the
-    track's noise, and plans as soon as there is a track. ``track_restarts`` and
-    ``track_rejected`` below ``plan`` count what did not fit.
+    Reads ``measured_pos`` (*B, M, D) and ``measured_time`` (*B, M), up to M measurements that arrived since the last
+    step; without them, ``target_pos`` counts as a measurement taken now. The planner sees the track's estimate of the
+    present position, the positions at past control steps, and the covariance; afterwards these entries are restored.
+    Rows without a usable track have `PlanStatus.NO_TRACK` and hold still until there is one. A planner with a second
+    forecaster for noisy measurements, `torchdyn_plan.nets.ForecastByNoise`, uses the one that fits the track's noise,
+    and plans as soon as there is a track. ``track_restarts`` and ``track_rejected`` under ``plan`` count measurements
+    that did not fit.
     """
 
     def __init__(
@@ -52,14 +52,14 @@ class TrackedPlanner(PretrainedPlanner, Remembering):
         control_step: float,
         history: int | None = None,
     ) -> None:
-        """Let ``planner`` see by ``track``.
+        """Put ``track`` in front of ``planner``.
 
         Args:
             planner: any planner for a moving target.
-            track: what becomes of the measurements.
+            track: the filter of the measurements.
             control_step: time between two steps [s].
-            history: positions H of the target's history; as many as the planner's forecaster reads for None, and 24
-                where it reads any number, or none.
+            history: length H of the target's history. None for the length that the planner's forecaster reads, or 24
+                if it accepts any length or reads no history.
         """
         super().__init__()
         check_number("control_step", control_step, minimum=1e-6)
@@ -69,7 +69,7 @@ class TrackedPlanner(PretrainedPlanner, Remembering):
         length = read_by_forecaster if history is None else history
         check_number("history", length, minimum=2, integer=True)
         if not isinstance(track, Track):
-            raise InputError(f"track must be a Track, as KalmanTrack(), got {type(track).__name__}")
+            raise InputError(f"track must be a Track such as KalmanTrack(), got {type(track).__name__}")
         if not isinstance(planner, TensorDictModuleBase):
             raise InputError(f"planner must be a planner of this package, got {type(planner).__name__}")
         self.planner, self.track, self.control_step, self.history = planner, track, control_step, length
@@ -86,7 +86,7 @@ class TrackedPlanner(PretrainedPlanner, Remembering):
         return getattr(self.planner, "scene", None)
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
-        """Take in what was measured, and let the planner act on it."""
+        """Update the track with the measurements, and run the planner on it."""
         like, step_count = read(tensordict, keys.TARGET_POS, "TrackedPlanner"), read(tensordict, keys.STEP_COUNT, "")
         check_points(keys.TARGET_POS, like)
         step_count = step_count.reshape(like.shape[:-1])
@@ -103,27 +103,27 @@ class TrackedPlanner(PretrainedPlanner, Remembering):
         return tensordict
 
     def empty_memory(self, like: Tensor) -> dict[str, Tensor]:
-        """The track's and the planner's, as `Remembering` says."""
+        """The memory of the track and of the planner, see `Remembering`."""
         inner = self.planner.empty_memory(like) if isinstance(self.planner, Remembering) else {}
         return dict(zip(NAMES, self.track.start(like), strict=True)) | inner
 
     def part_settings(self) -> dict[str, Any]:
-        """Arguments that make the same planner."""
+        """Constructor arguments of this planner."""
         names = ("planner", "track", "control_step", "history")
         return {name: getattr(self, name) for name in names}
 
     def with_planner(self, planner: Callable[[TensorDictBase], TensorDictBase]) -> Self:
-        """The same track before another planner."""
+        """The same track in front of another planner."""
         settings: dict[str, Any] = self.part_settings() | {"planner": planner}
         return type(self)(**settings).train(self.training)
 
     def for_inference(self) -> Self:
-        """The same on copies of the planner's networks as they are now, in as few operations as possible."""
+        """A copy with the planner's current networks prepared for inference, in as few operations as possible."""
         fast = getattr(self.planner, "for_inference", None)
         return self if fast is None else self.with_planner(fast())
 
     def _recall(self, tensordict: TensorDictBase, like: Tensor, step_count: Tensor) -> TrackState:
-        """The state after the step before; rows at step 0, and those whose memory is no number, start afresh."""
+        """The state after the last step; rows at step 0, and those whose memory holds a NaN, restart."""
         start, plan = self.track.start(like), tensordict.get(keys.PLAN, None)
         stored: dict[str, Any] = {} if plan is None else dict(plan.items())
         if any(name not in stored for name in NAMES):
@@ -144,7 +144,7 @@ class TrackedPlanner(PretrainedPlanner, Remembering):
         return state
 
     def _shown(self, state: TrackState, present: TrackState, usable: Tensor, now: Tensor) -> tuple[Tensor, ...]:
-        """What the planner sees, as in `SHOWN`; no numbers in rows without a usable track."""
+        """What the planner sees, in the order of `SHOWN`; NaN in rows without a usable track."""
         ago = self.control_step * torch.arange(1 - self.history, 1, dtype=now.dtype, device=now.device)
         history = where_rows(
             usable, state.path(now.unsqueeze(-1) + ago), torch.full_like(now, torch.nan)[..., None, None]
@@ -165,7 +165,7 @@ class TrackedPlanner(PretrainedPlanner, Remembering):
 
 
 def _restore(tensordict: TensorDictBase, key: str, value: Tensor | None) -> None:
-    """Put ``value`` back, or take the entry ``key`` away that was not there."""
+    """Set ``key`` back to ``value``, or remove it if it was not there before."""
     if value is not None:
         tensordict.set(key, value)
     elif key in tensordict.keys():  # noqa: SIM118

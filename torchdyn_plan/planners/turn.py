@@ -1,4 +1,4 @@
-"""How a tool is to be turned where it meets its target: a part of planners whose goals are poses."""
+"""Orientation of the tool where it meets its target: a part of planners whose goals are poses."""
 
 from __future__ import annotations
 
@@ -17,40 +17,40 @@ from torchdyn_plan.kinematics.quaternions import quat_matrix, quat_multiply
 
 
 class Turn(Protocol):
-    """Says how the tool is to be turned at each place of a forecast."""
+    """Gives the tool's orientation at each position of a forecast."""
 
     @property
     def in_keys(self) -> Sequence[Any]:
-        """Entries that it reads of the observation, beside where the target is."""
+        """Keys that it reads from the observation in addition to the target's position."""
         ...
 
     def __call__(self, path: Tensor, target_pos: Tensor, /, *seen: Tensor) -> Tensor:
-        """Quaternions wxyz ``(*B, F, 4)`` of the tool in the world; zeros where it may be turned as it is.
+        """Quaternions wxyz ``(*B, F, 4)`` of the tool in the world; zeros where any orientation will do.
 
         Args:
-            path: ``(*B, F, 3)`` where the target is expected in 1 … F control steps [m, world].
-            target_pos: ``(*B, 3)`` where it is now.
-            seen: the entries ``in_keys``, ``(*B, …)`` each.
+            path: ``(*B, F, 3)`` forecast of the target for 1 … F control steps [m, world].
+            target_pos: ``(*B, 3)`` its current position [m, world].
+            seen: the values of ``in_keys``, ``(*B, …)`` each.
         """
         ...
 
 
 @dataclass(frozen=True, kw_only=True)
 class WithTarget:
-    """The tool is turned with the target, which keeps turned as it is: ``target_quat`` is read.
+    """Aligns the tool with the target, whose orientation (``target_quat``) is assumed constant.
 
-    The default looks down on a target that lies flat: the tool's z axis is against the target's, and the x axes agree.
+    By default the tool points down on a target that lies flat: z axes opposed, x axes aligned.
     """
 
     in_keys: ClassVar[tuple[str, ...]] = (keys.TARGET_QUAT,)
 
     quat: tuple[float, float, float, float] = (0.0, 1.0, 0.0, 0.0)
-    """How the tool is turned in the target's frame, quaternion wxyz."""
+    """Orientation of the tool in the target's frame, quaternion wxyz."""
     symmetry: int = 1
-    """The tool is the same after one ``symmetry``-th of a turn about its z axis …"""
+    """Order of the tool's rotational symmetry about its z axis."""
     facing: tuple[float, float, float] = (1.0, 0.0, 0.0)
-    """… and of its turns that are alike it takes that whose x axis is nearest to this direction in the world: so that
-    no joint is turned farther and farther from target to target."""
+    """Of the equivalent orientations, the one whose x axis is nearest to this world direction is taken, so that no
+    joint winds up from target to target."""
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "quat", tuple(self.quat))
@@ -71,7 +71,7 @@ class WithTarget:
         return quat.unsqueeze(-2).expand(*path.shape[:-1], 4)
 
     def _nearest(self, quat: Tensor) -> Tensor:
-        """Of the turns that are alike to ``quat`` (*B, 4) for the tool the one that faces as it should."""
+        """The orientation equivalent to ``quat`` (*B, 4) under the tool's symmetry that is nearest to ``facing``."""
         half = math.pi / self.symmetry * torch.arange(self.symmetry, dtype=quat.dtype, device=quat.device)
         zero = torch.zeros_like(half)
         alike = torch.stack([half.cos(), zero, zero, half.sin()], dim=-1)

@@ -1,12 +1,11 @@
-"""Collected data, fits of networks to it, and policies that learn by trial: for any task.
+"""Data collection, network fits and policy training, for any task.
 
-What a task needs to say of its data and networks is imported from here, when it is asked for.
+A task takes from here what it needs to describe its data and networks.
 """
 
-from __future__ import annotations
+from typing import TYPE_CHECKING
 
-from importlib import import_module
-from typing import TYPE_CHECKING, Any
+from torchdyn_plan.lazy import lazy_names
 
 if TYPE_CHECKING:
     from torchdyn_plan.training.averaged import AveragedRecipe
@@ -18,22 +17,6 @@ if TYPE_CHECKING:
     from torchdyn_plan.training.sighted_data import Sighting
     from torchdyn_plan.training.sightings import SensorRange
     from torchdyn_plan.training.windows import WindowConfig
-
-_PLACES = {
-    "AveragedRecipe": "averaged",
-    "DDPGRecipe": "goal_task",
-    "ExtraCoverage": "fitting",
-    "Fitting": "fitting",
-    "GoalTask": "goal_task",
-    "Recipe": "optimise",
-    "RunPlan": "runs",
-    "SensorRange": "sightings",
-    "Sighting": "sighted_data",
-    "WindowConfig": "windows",
-    "lay_end_to_end": "path_data",
-    "record_runs": "runs",
-}
-"""Module of this folder that defines each name."""
 
 __all__ = [
     "AveragedRecipe",
@@ -50,8 +33,17 @@ __all__ = [
     "record_runs",
 ]
 
-
-def __getattr__(name: str) -> Any:
-    if name not in _PLACES:
-        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
-    return getattr(import_module(f"{__name__}.{_PLACES[name]}"), name)
+__getattr__, __dir__ = lazy_names(
+    __name__,
+    {
+        "averaged": ("AveragedRecipe",),
+        "fitting": ("ExtraCoverage", "Fitting"),
+        "goal_task": ("DDPGRecipe", "GoalTask"),
+        "optimise": ("Recipe",),
+        "path_data": ("lay_end_to_end",),
+        "runs": ("RunPlan", "record_runs"),
+        "sighted_data": ("Sighting",),
+        "sightings": ("SensorRange",),
+        "windows": ("WindowConfig",),
+    },
+)

@@ -1,34 +1,18 @@
-"""Watching an episode: a recording of it step by step, drawn on a page in the browser or into a file.
-
-Everything named here is imported when it is first used.
-"""
-
-from __future__ import annotations
+"""Watch an episode: record it step by step, and show it in the browser or write it to a file."""
 
 import os
 import sys
 from importlib import import_module
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 from torchdyn_plan.errors import InputError
+from torchdyn_plan.lazy import lazy_names
 
 if TYPE_CHECKING:
     from torchdyn_plan.view.files import check_film, write_film
     from torchdyn_plan.view.page import Page, serve
     from torchdyn_plan.view.pictures import Film
     from torchdyn_plan.view.recording import Recording, Scenario, record_episode
-
-_PLACES = {
-    "Film": "pictures",
-    "Page": "page",
-    "Recording": "recording",
-    "Scenario": "recording",
-    "check_film": "files",
-    "record_episode": "recording",
-    "serve": "page",
-    "write_film": "files",
-}
-"""Module of this folder that defines each name."""
 
 __all__ = [
     "Film",
@@ -42,15 +26,15 @@ __all__ = [
     "write_film",
 ]
 
-
-def __getattr__(name: str) -> Any:
-    if name not in _PLACES:
-        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
-    return getattr(import_module(f"{__name__}.{_PLACES[name]}"), name)
-
-
-def __dir__() -> list[str]:
-    return sorted({*globals(), *__all__})
+__getattr__, __dir__ = lazy_names(
+    __name__,
+    {
+        "files": ("check_film", "write_film"),
+        "page": ("Page", "serve"),
+        "pictures": ("Film",),
+        "recording": ("Recording", "Scenario", "record_episode"),
+    },
+)
 
 
 def draw_without_screen() -> None:

@@ -102,7 +102,9 @@ def mp4_writer() -> Any:
     try:
         import imageio_ffmpeg  # pyright: ignore[reportMissingImports]
     except ImportError as error:
-        raise InputError("an MP4 needs imageio-ffmpeg: pip install imageio-ffmpeg, or choose .webp or .gif") from error
+        raise InputError(
+            "an MP4 needs imageio-ffmpeg, of the extra view: pip install imageio-ffmpeg, or choose .webp or .gif"
+        ) from error
     return imageio_ffmpeg
 
 

@@ -107,5 +107,5 @@ def test_the_compiled_planner_does_the_same(batch):
 
 @pytest.mark.parametrize("bad", [None, "ur5", 6])
 def test_without_an_arm_one_sentence_says_what_is_missing(bad):
-    with pytest.raises(InputError, match=r"arm must be an Arm, as from Arm.from_urdf or Arm.ur5, got \w+$"):
+    with pytest.raises(InputError, match=r"arm must be an Arm, such as Arm.ur5\(\) or Arm.from_urdf\(...\), got \w+$"):
         IKPlanner(bad)

@@ -123,7 +123,7 @@ def test_its_arrival_model_knows_when_a_pose_is_reached():
 def test_what_cannot_be_is_named():
     with pytest.raises(InputError, match="compiled IKPlanner takes neither poses nor an acceleration"):
         planner_of(compiled=True)
-    with pytest.raises(InputError, match="acceleration must be one number or 6"):
+    with pytest.raises(InputError, match="acceleration must be one number, or 6"):
         planner_of(acceleration=(1.0, 2.0))
     with pytest.raises(InputError, match="acceleration must be >="):
         planner_of(acceleration=-1.0)

@@ -1,4 +1,4 @@
-"""How a tool comes to its goal: which way it goes from where it is."""
+"""How the tool approaches its goal."""
 
 from __future__ import annotations
 
@@ -16,28 +16,28 @@ from torchdyn_plan.kinematics.targets import nearest_turn, rotation_vector
 
 
 class Approach(Protocol):
-    """A rule by which a tool comes to its goal.
+    """A rule by which the tool approaches its goal.
 
-    Coordinates come one by one, so that a compiler can fuse the rule into the loop around it.
+    Coordinates are passed one by one, so that a compiler can fuse the rule into the surrounding loop.
     """
 
     def twist(self, pose: Sequence[Tensor], goal: Sequence[Tensor], /) -> list[Tensor]:
-        """The twist still to go, the first R of its six rows [v; ω] in m and rad, in the arm's base frame.
+        """The remaining twist: the first R of its six rows [v; ω] in m and rad, in the arm's base frame.
 
         Args:
             pose: the first three rows of the tool's pose in the base frame, entry by entry [m].
-            goal: x, y and z [m, world]; of an approach with ``reads_pose`` the quaternion wxyz after them.
+            goal: x, y and z [m, world], followed by the quaternion wxyz for an approach with ``reads_pose``.
         """
         ...
 
     def within_reach(self, goal: Tensor, /) -> Tensor:
-        """``goal`` (*B, 3) [m, world], or the nearest place to it where the tool can be."""
+        """``goal`` (*B, 3) [m, world], or the nearest position that the tool can reach."""
         ...
 
 
 @dataclass(frozen=True, kw_only=True)
 class StraightToGoal:
-    """The tool goes straight to its goal, however it is turned: the approach of an arm that is given none."""
+    """The tool goes straight to its goal, in any orientation. The default approach."""
 
     base_pos: tuple[float, float, float] = (0.0, 0.0, 0.0)
     """Position of the arm's base frame in the world, axes parallel [m]."""
@@ -50,7 +50,7 @@ class StraightToGoal:
             check_number("base_pos", coordinate)
 
     def twist(self, pose: Sequence[Tensor], goal: Sequence[Tensor]) -> list[Tensor]:
-        """The way from the tool to the goal."""
+        """The vector from the tool to the goal."""
         place = pose[3], pose[7], pose[11]
         return [end - start - base for end, start, base in zip(goal, place, self.base_pos, strict=True)]
 
@@ -61,9 +61,9 @@ class StraightToGoal:
 
 @dataclass(frozen=True, kw_only=True)
 class TurnedToGoal:
-    """The tool goes straight to its goal, and turns as ``goal_pose`` says on the way there.
+    """The tool goes straight to its goal, and turns to the orientation in ``goal_pose`` on the way.
 
-    A quaternion of zeros leaves the tool turned as it is.
+    A zero quaternion keeps the tool's orientation.
     """
 
     reads_pose: ClassVar[bool] = True
@@ -71,8 +71,8 @@ class TurnedToGoal:
     base_pos: tuple[float, float, float] = (0.0, 0.0, 0.0)
     """Position of the arm's base frame in the world, axes parallel [m]."""
     symmetry: int = 1
-    """The tool is the same after one ``symmetry``-th of a turn about its z axis: 2 for a two-finger gripper, 4 for a
-    square box, 0 for a round cup, of which only the z axis counts."""
+    """Order of the tool's rotational symmetry about its z axis: 2 for a two-finger gripper, 4 for a square box, 0 for a
+    round cup, where only the direction of the z axis counts."""
 
     def __post_init__(self) -> None:
         StraightToGoal(base_pos=self.base_pos)
@@ -80,7 +80,7 @@ class TurnedToGoal:
         check_number("symmetry", self.symmetry, minimum=0, integer=True)
 
     def twist(self, pose: Sequence[Tensor], goal: Sequence[Tensor]) -> list[Tensor]:
-        """The way from the tool to the goal, and the turn that is left, a rotation vector in the base frame."""
+        """The vector from the tool to the goal, and the remaining rotation vector, in the base frame."""
         place, quat = goal[:3], torch.stack(list(goal[3:]), dim=-1)
         way = StraightToGoal(base_pos=self.base_pos).twist(pose, place)
         turned = torch.stack([torch.stack(list(pose[row : row + 3]), dim=-1) for row in (0, 4, 8)], dim=-2)
@@ -88,7 +88,7 @@ class TurnedToGoal:
         return [*way, *turn.unbind(-1)]
 
     def _turn(self, turned: Tensor, wanted: Tensor) -> Tensor:
-        """Rotation vector ``(*B, 3)`` [rad] from one rotation to another, ``(*B, 3, 3)`` each, or to its like."""
+        """Rotation vector ``(*B, 3)`` [rad] between rotations ``(*B, 3, 3)``, the smallest under the symmetry."""
         if self.symmetry == 0:
             start, end = turned[..., 2], wanted[..., 2]
             return rotation_vector(quat_matrix(quat_between(start, end)))
@@ -102,5 +102,5 @@ class TurnedToGoal:
 
 
 def reads_pose(approach: Approach) -> bool:
-    """Whether an approach is told how the tool is to be turned: its goals are ``goal_pose``."""
+    """Whether an approach reads the tool's orientation: its goals are ``goal_pose``."""
     return bool(getattr(approach, "reads_pose", False))

@@ -1,4 +1,4 @@
-"""What the static planners of this package share."""
+"""Base class of the static planners of this package."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from torchdyn_plan.planners.memory import Remembering
 
 
 class StaticPlannerModule(Remembering):
-    """A planner for a static goal that reads and writes tensordicts, as `StaticPlanner` says."""
+    """A planner for a static goal that reads and writes tensordicts, see `StaticPlanner`."""
 
     comes_to_rest: ClassVar[bool] = True
     """Whether the robot comes to rest where it cannot get nearer to its goal."""

@@ -1,4 +1,4 @@
-"""A person's own function as a static planner."""
+"""Your own function as a static planner."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ class CallablePlanner(StaticPlannerModule):
     def __init__(
         self, function: Callable[..., Tensor], *, in_keys: Sequence[NestedKey] = (keys.ROBOT_STATE, keys.GOAL)
     ) -> None:
-        """Wrap ``function`` (an `nn.Module` too), which is given the entries ``in_keys`` in that order."""
+        """Wrap ``function`` (or an `nn.Module`), which is given the values of ``in_keys`` in that order."""
         super().__init__()
         if not callable(function):
             raise InputError(f"function must be callable, got {function!r}")
@@ -45,7 +45,7 @@ class TensorDictFunction(StaticPlannerModule):
     """Static planner made of a function from tensordict to tensordict."""
 
     def __init__(self, function: Callable[[TensorDictBase], TensorDictBase]) -> None:
-        """Wrap ``function``, which writes ``action`` (*B, A) and says of no other key that it reads or writes it."""
+        """Wrap ``function``, which writes ``action`` (*B, A) and declares no other keys."""
         super().__init__()
         self.function = function
         self.in_keys, self.out_keys = [keys.GOAL], [keys.ACTION]
@@ -61,5 +61,5 @@ class TensorDictFunction(StaticPlannerModule):
         return cls(function)
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
-        """What the function does."""
+        """Call the function."""
         return self.function(tensordict)

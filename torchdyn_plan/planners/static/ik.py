@@ -1,4 +1,4 @@
-"""The static planner by inverse kinematics: damped least squares, five steps of the path at a time."""
+"""Static planner by inverse kinematics: damped least squares, five steps of the path at a time."""
 
 from __future__ import annotations
 
@@ -29,28 +29,28 @@ from torchdyn_plan.precision import Precise
 
 
 class Path(NamedTuple):
-    """Where each arm's path stands; its names below ``plan`` begin with ``path_``."""
+    """Progress along each arm's path; its names under ``plan`` begin with ``path_``."""
 
     pos: Tensor
-    """``(*B, N)`` joint angles to which it has come [rad]."""
+    """``(*B, N)`` joint angles reached on it [rad]."""
     step: Tensor
-    """``(*B,)`` int64 steps of it that are made."""
+    """``(*B,)`` int64 number of its steps taken."""
     goal: Tensor
-    """``(*B, 3)`` where it leads [m, world]; of a planner of poses ``(*B, 7)``."""
+    """``(*B, 3)`` its goal [m, world]; ``(*B, 7)`` for a planner of poses."""
 
 
 PASSES = 2
-"""Times that a step is solved again without the joints that it would push beyond their limits."""
+"""Number of times a step is solved again without the joints that it would push beyond their limits."""
 GOAL_STEPS, GOAL_STEP = 10, 0.5
-"""Steps in which the end of a path is found, and the most that a joint moves in one of them [rad]."""
+"""Steps used to find the end of a path, and the most that a joint moves in one of them [rad]."""
 GOAL_DAMPING = 0.005
 """λ of these steps."""
 GOAL_TOLERANCE = 0.015
-"""A tool within this of its goal is there [m]."""
+"""A tool within this distance of its goal has arrived [m]."""
 TURN_TOLERANCE = 0.05
-"""The same of how it is turned [rad]."""
+"""The same for its orientation [rad]."""
 GOAL_SPEED = 2.0
-"""A goal that is another one than a step before, nearer than this speed explains, moves; else it is a new one [m/s]."""
+"""A goal that changes no faster than this is a moving goal; a larger jump is a new goal [m/s]."""
 PATH_NAMES = tuple(f"path_{field}" for field in Path._fields)
 PATH_SET = frozenset(PATH_NAMES)
 
@@ -59,12 +59,12 @@ class IKPlanner(Precise, StaticPlannerModule):
     """Drives an arm's tool to ``goal`` by inverse kinematics, along the path of its approach.
 
     Reads ``joint_pos`` (*B, N) [rad], ``goal`` (*B, 3) [m, world] and ``step_count`` (*B,); writes ``action`` (*B, N)
-    and its memory under ``plan``. The arm follows a path of `PATH_LENGTH` steps from where it was when the path began,
-    whatever it does meanwhile; the path is flushed when the goal changes (paper, Section III-B.1), and rows with
-    ``step_count`` 0 start afresh. A control step solves that step of the path alone: a flushed path costs nothing.
+    and its memory under ``plan``. The arm follows a path of `PATH_LENGTH` steps from its position at the start of the
+    path, in open loop; the path is flushed when the goal changes (paper, Section III-B.1), and rows with ``step_count``
+    0 restart. Each control step solves one step of the path only, so a flushed path costs nothing.
 
-    With an approach that turns the tool, `TurnedToGoal`, it reads ``goal_pose`` (*B, 7) in place of ``goal``, and so do
-    its methods.
+    With an approach that turns the tool, `TurnedToGoal`, it and its methods read ``goal_pose`` (*B, 7) instead of
+    ``goal``.
     """
 
     PATH_LENGTH = 5
@@ -86,21 +86,21 @@ class IKPlanner(Precise, StaticPlannerModule):
         """Plan for ``arm`` at ``control_step`` [s].
 
         Args:
-            arm: whose tool frame is brought to the goal.
-            approach: how the tool comes to a goal; straight, from a base at the world's origin, by default.
+            arm: the arm, whose tool frame is driven to the goal.
+            approach: how the tool approaches a goal; straight, from a base at the world's origin, by default.
             control_step: time between two actions [s].
             damping: λ of the least squares.
             gain: share of the remaining joint error that one step may cover, which brakes the arm at the end.
-            acceleration: limit of each joint, or of all of them [rad/s²]: the arm brakes by it and not by ``gain``, and
-                goes along with a goal that moves, a control step behind it. None for the gain alone.
+            acceleration: limit of each joint, or of all of them [rad/s²]. The arm then brakes by this limit instead of
+                ``gain``, and follows a moving goal one control step behind it. None for the gain only.
             chunk: solve in blocks of exactly this many rows, so that results do not depend on the batch size.
-            compiled: solve in one compiled loop, which takes a C++ compiler and some seconds at the first call (less
-                where torch finds it in its cache); actions are the same but for rounding, do not depend on the batch
-                size, and have no derivatives.
+            compiled: solve in one compiled loop. Needs a C++ compiler and some seconds at the first call (less if torch
+                has it cached); actions are the same up to rounding, do not depend on the batch size, and have no
+                derivatives.
         """
         super().__init__()
         if not isinstance(arm, Arm):
-            raise InputError(f"arm must be an Arm, as from Arm.from_urdf or Arm.ur5, got {type(arm).__name__}")
+            raise InputError(f"arm must be an Arm, such as Arm.ur5() or Arm.from_urdf(...), got {type(arm).__name__}")
         if chunk is not None:
             check_number("chunk", chunk, minimum=1, integer=True)
         self.arm, self.approach = arm, approach or StraightToGoal()
@@ -120,7 +120,7 @@ class IKPlanner(Precise, StaticPlannerModule):
         self.register_buffer("_brake", None if acceleration is None else self._brake_of(acceleration), False)
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
-        """Write ``action`` for the ``goal`` in ``tensordict``, on a new path where the old one is used up or stale.
+        """Write ``action`` for the ``goal`` in ``tensordict``, on a new path if the old one is finished or stale.
 
         Raises:
             InputError: a key is missing, a shape is wrong, or the goal holds a NaN or an infinity.
@@ -146,17 +146,17 @@ class IKPlanner(Precise, StaticPlannerModule):
         return tensordict
 
     def empty_memory(self, like: Tensor) -> dict[str, Tensor]:
-        """The entries of a path that is used up, as `Remembering` says."""
+        """The entries of a finished path, see `Remembering`."""
         batch = like.shape[:-1]
         step = torch.full(batch, self.PATH_LENGTH, dtype=torch.int64, device=like.device)
         path = Path(like.new_zeros(*batch, self.arm.num_joints), step, like.new_zeros(*batch, self.goal_size))
         return dict(zip(PATH_NAMES, path, strict=True))
 
     def arrival_model(self) -> AnalyticArrival:
-        """When its joints are at a goal: ``robot_state`` is to begin with the joints' positions and speeds.
+        """Model of its arrival times; ``robot_state`` must begin with the joints' positions and speeds.
 
-        It takes them for as quick to speed up as the planner is to brake, by its acceleration, or within ``1 / gain``
-        control steps; a robot that lags, or is told its limits, has an `AnalyticArrival` of its own.
+        It assumes that joints speed up as fast as the planner brakes: at its acceleration, or within ``1 / gain``
+        control steps. For a robot that lags, or with other limits, make your own `AnalyticArrival`.
         """
         speed = self._limit / self.control_step
         if self.acceleration is None:
@@ -166,26 +166,26 @@ class IKPlanner(Precise, StaticPlannerModule):
         return AnalyticArrival(self, speed=speed, acceleration=acceleration, control_step=self.control_step)
 
     def part_settings(self) -> dict[str, Any]:
-        """Arguments that make the same planner."""
+        """Constructor arguments of this planner."""
         names = ("arm", "approach", "control_step", "damping", "gain", "chunk", "compiled")
-        # Planners that are older than the acceleration keep their description.
+        # Left out if absent, so that planners saved before this setting existed keep their description.
         others = () if self.acceleration is None else ("acceleration",)
         return {name: getattr(self, name) for name in (*names, *others)}
 
     def _brake_of(self, acceleration: float | Sequence[float]) -> Tensor:
-        """The most that each joint's step changes by from one control step to the next, ``(N,)`` [rad]."""
+        """Largest change of each joint's step from one control step to the next, ``(N,)`` [rad]."""
         count = self.arm.num_joints
         values = [acceleration] * count if isinstance(acceleration, (int, float)) else list(acceleration)
         if len(values) != count:
-            raise InputError(f"acceleration must be one number or {count}, one for each joint, got {len(values)}")
+            raise InputError(f"acceleration must be one number, or {count}, one for each joint, got {len(values)}")
         for value in values:
             check_number("acceleration", value, minimum=1e-6)
         return self._limit.new_tensor(values) * self.control_step**2
 
     def _recall(self, plan: Any, joint_pos: Tensor, goal: Tensor, step_count: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-        """Where the path stands, (*B, N), its step (*B,), and the goal of the step before, or that of now.
+        """The path's joint angles (*B, N), its step (*B,), and the last step's goal, or else the present one.
 
-        Where ``plan`` holds none to follow, a new path begins.
+        A new path begins where ``plan`` holds none to follow.
         """
         stored: dict[str, Any] = {} if plan is None else dict(plan.items())
         if not stored.keys() >= PATH_SET:
@@ -199,7 +199,7 @@ class IKPlanner(Precise, StaticPlannerModule):
         return torch.where(ends.unsqueeze(-1), joint_pos, path.pos), path.step.masked_fill(ends, 0), before
 
     def _step_blocks(self, joint_pos: Tensor, *goals: Tensor) -> tuple[Tensor, Tensor]:
-        """`step`, in blocks of ``chunk`` rows, of which the last is filled up."""
+        """`step` in blocks of ``chunk`` rows, the last one padded."""
         assert self.chunk is not None
         batch, padding = joint_pos.shape, (0, 0, 0, -joint_pos.shape[:-1].numel() % self.chunk)
         rows = [nn.functional.pad(value.reshape(-1, value.shape[-1]), padding) for value in (joint_pos, *goals)]
@@ -221,12 +221,12 @@ class IKPlanner(Precise, StaticPlannerModule):
         return torch.stack(actions, dim=-2)
 
     def goal_joints(self, joint_pos: Tensor, goal: Tensor) -> tuple[Tensor, Tensor]:
-        """Where the path from ``joint_pos`` (*B, N) [rad] to ``goal`` (*B, 3) [m, world] ends; differentiable.
+        """End of the path from ``joint_pos`` (*B, N) [rad] to ``goal`` (*B, 3) [m, world]; differentiable.
 
-        The path is that of the approach in `GOAL_STEPS` long steps, in place of the many of a path that is driven.
+        It is computed in `GOAL_STEPS` long steps of the approach, instead of the many steps of a real path.
 
         Returns:
-            Joint angles ``(*B, N)`` [rad], and ``(*B,)`` bool: the tool is at the goal then, within `GOAL_TOLERANCE`.
+            Joint angles ``(*B, N)`` [rad], and ``(*B,)`` bool: the tool is then at the goal, within `GOAL_TOLERANCE`.
         """
         goal = goal.to(self._limit.dtype)
         q = joint_pos.to(goal.dtype).expand(*goal.shape[:-1], joint_pos.shape[-1])
@@ -247,18 +247,18 @@ class IKPlanner(Precise, StaticPlannerModule):
         return q.view(*batch, -1), reached.view(batch)
 
     def _way(self, pose: Tensor, goal: Tensor) -> Tensor:
-        """The twist still to go from poses (R, 4, 4) to goals (R, 3 or 7)."""
+        """The remaining twist from poses (R, 4, 4) to goals (R, 3 or 7)."""
         return torch.stack(self.approach.twist(pose[..., :3, :].flatten(-2).unbind(-1), goal.unbind(-1)), dim=-1)
 
     def step(self, joint_pos: Tensor, goal: Tensor, before: Tensor | None = None) -> tuple[Tensor, Tensor]:
         """One step of the path from ``joint_pos`` (*B, N) [rad] towards ``goal`` (*B, 3) [m, world].
 
-        With an acceleration, ``before`` (*B, 3) is the goal of the step before: the step goes along with its motion.
+        With an acceleration, ``before`` (*B, 3) is the last step's goal, and the step follows the goal's motion.
 
         Returns:
-            The action ``(*B, N)`` and the joint angles to which the path has come ``(*B, N)`` [rad].
+            The action ``(*B, N)`` and the joint angles reached on the path ``(*B, N)`` [rad].
         """
-        # A module's attribute that is a buffer takes as long to look up as a small operation; its table does not.
+        # Looking up a buffer as a module's attribute costs as much as a small operation; its table is cheaper.
         dtype = cast(Tensor, self._buffers["_limit"]).dtype
         if joint_pos.dtype != dtype or goal.dtype != dtype:
             joint_pos, goal = joint_pos.to(dtype), goal.to(dtype)
@@ -279,7 +279,7 @@ class IKPlanner(Precise, StaticPlannerModule):
     def _step_braked(
         self, joint_pos: Tensor, goal: Tensor, before: Tensor, pose: Tensor, jacobian: Tensor
     ) -> tuple[Tensor, Tensor]:
-        """`step` by the acceleration: the way to the last goal is braked, and what it moved since then is added."""
+        """`step` with an acceleration limit: braked towards the last goal, plus the goal's motion since then."""
         error, old = self._way(pose, goal), self._way(pose, before.to(goal.dtype))
         moved = error - old
         moves = moved[..., :3].norm(dim=-1, keepdim=True) <= GOAL_SPEED * self.control_step
@@ -292,12 +292,12 @@ class IKPlanner(Precise, StaticPlannerModule):
         return (step / self._limit).clamp(-1.0, 1.0), joint_pos + step
 
     def _within(self, whole: Tensor, rows: Tensor, error: Tensor, low: Tensor, high: Tensor) -> Tensor:
-        """``whole``, or where it pushes a joint out of its limits what the others make of it."""
+        """``whole``, or, where it pushes a joint out of its limits, a step by the other joints."""
         pushes = ((low >= 0.0) & (whole < 0.0)) | ((high <= 0.0) & (whole > 0.0))
         return self._without_held(whole, rows, error, low, high) if bool(pushes.any()) else whole
 
     def _step_from(self, joint_pos: Tensor, goal: Tensor, pose: Tensor, jacobian: Tensor) -> tuple[Tensor, Tensor]:
-        """`step` where the tool's pose and Jacobian are known."""
+        """`step` for known pose and Jacobian of the tool."""
         error = torch.stack(self.approach.twist(pose.flatten(-2).unbind(-1), goal.unbind(-1)), dim=-1)
         rows = jacobian if error.shape[-1] == 6 else jacobian[..., : error.shape[-1], :]
         limit, bounds = cast(Tensor, self._buffers["_limit"]), cast(dict[str, Tensor], self.arm._buffers)
@@ -305,7 +305,7 @@ class IKPlanner(Precise, StaticPlannerModule):
         whole = dls_step(rows, error, self.damping)
         wanted = limited_step(whole, limit, self.gain)
         step = torch.clamp(wanted, low, high)
-        # Where nothing was cut off, no joint is pushed out of its limits.
+        # If nothing was clamped, no joint is pushed out of its limits.
         plain = not torch.compiler.is_compiling() and debug_unwrap(step) is step
         if not (plain and torch.equal(step, wanted)):
             whole = self._without_held(whole, rows, error, low, high)
@@ -313,7 +313,7 @@ class IKPlanner(Precise, StaticPlannerModule):
         return (step / limit).clamp(-1.0, 1.0), joint_pos + step
 
     def _without_held(self, whole: Tensor, rows: Tensor, error: Tensor, low: Tensor, high: Tensor) -> Tensor:
-        """``whole``, a step (*B, N), by the joints that may move: those at a limit that it pushes out are left out."""
+        """``whole``, a step (*B, N), solved again without the joints at a limit that it would push out."""
         at_lower, at_upper = low >= 0.0, high <= 0.0
         held = torch.zeros_like(at_lower)
         for _ in range(PASSES):
@@ -323,10 +323,10 @@ class IKPlanner(Precise, StaticPlannerModule):
         return whole
 
     def _step_fused(self, joint_pos: Tensor, goal: Tensor) -> tuple[Tensor, Tensor]:
-        """`step` of rows in one compiled loop; rows that push a joint beyond its limits are solved again."""
+        """`step` in one compiled loop; rows that push a joint beyond its limits are solved again."""
         assert self._fused is not None
         action, reached, room = self._fused(joint_pos, goal)
-        # A row alone is read as it is: to look for the least would take a tenth of the step.
+        # A single row is read directly: a minimum would take a tenth of the step's time.
         if not (room if room.numel() == 1 else room.amin()).item() > 0.0:
             rows = (room.squeeze(-1) <= 0.0).nonzero().squeeze(-1)
             joint_pos, goal = joint_pos[rows], goal[rows]
@@ -334,9 +334,9 @@ class IKPlanner(Precise, StaticPlannerModule):
         return action, reached
 
     def _fused_step(self, joint_pos: Columns, goal: Columns) -> tuple[Vector, Vector, Vector]:
-        """`step`, column by column, all joints taking part; and the least way that one has to the limit ahead [rad].
+        """`step` column by column with all joints; and each row's least distance from a joint to the limit ahead [rad].
 
-        Where that is none, a joint at its limit should not have taken part.
+        A joint for which that is 0 is at its limit, and should have been left out.
         """
         rotation, place, jacobian = self.arm.components(joint_pos)
         pose = [entry for row, end in zip(rotation, place, strict=True) for entry in (*row, end)]
@@ -355,7 +355,7 @@ class IKPlanner(Precise, StaticPlannerModule):
         return action, [here + value for here, value in zip(joint_pos, step, strict=True)], [room]
 
     def _pose_and_jacobian(self, joint_pos: Tensor) -> tuple[Tensor, Tensor]:
-        """The arm's, from products of always ``chunk`` rows where ``joint_pos`` is a multiple of them."""
+        """The arm's pose and Jacobian, in blocks of ``chunk`` rows if ``joint_pos`` is a multiple of them."""
         if self.chunk is None or joint_pos.ndim != 2:
             return self.arm.pose_and_jacobian(joint_pos)
         pose, jacobian = zip(*map(self.arm.pose_and_jacobian, joint_pos.split(self.chunk)), strict=True)

@@ -1,4 +1,4 @@
-"""Static planner for a point with limits on speed and acceleration and a velocity command: a base, a drone."""
+"""Static planner for a velocity-controlled point with limited speed and acceleration: a mobile base, a drone."""
 
 from __future__ import annotations
 
@@ -14,22 +14,22 @@ from torchdyn_plan.planners.protocol import read
 from torchdyn_plan.planners.static.base import StaticPlannerModule
 
 NEAR = 1e-9
-"""Nearer to its goal than this a point has no direction to go [m]."""
+"""Closer to its goal than this, a point has no direction to move in [m]."""
 FADE = 0.25
-"""Share of the last bit of way that is covered in a control step."""
+"""Share of the last remaining distance that is covered in a control step."""
 
 
 class PointPlanner(StaticPlannerModule):
     """Moves a point straight to ``goal`` as fast as allowed; ``action`` is velocity as a fraction of the speed limit.
 
-    Reads ``tool_pos`` (*B, D) and ``goal`` (*B, D) [m, world], writes ``action`` (*B, D) of size 0 to 1. One that stops
-    brakes within its acceleration. It has no memory.
+    Reads ``tool_pos`` (*B, D) and ``goal`` (*B, D) [m, world], writes ``action`` (*B, D) of norm 0 to 1. It brakes
+    within its acceleration limit, and has no memory.
     """
 
     def __init__(
         self, *, speed: float, acceleration: float, control_step: float, stops: bool = True, radius: float = 0.0
     ) -> None:
-        """Go with at most ``speed``; arguments as of `torchdyn_plan.nets.PointArrival`."""
+        """Move with at most ``speed``; for the arguments see `torchdyn_plan.nets.PointArrival`."""
         super().__init__()
         self.limits = PointArrival(
             speed=speed, acceleration=acceleration, control_step=control_step, stops=stops, radius=radius
@@ -46,7 +46,7 @@ class PointPlanner(StaticPlannerModule):
         far = torch.linalg.vector_norm(offset, dim=-1, keepdim=True)
         fastest = torch.full_like(far, limits.speed).masked_fill(far <= NEAR, 0.0)
         if limits.stops:
-            # It brakes a step later than it sees: v²/2a + v dt + a dt²/2 ≤ way. The last bit is left to fade.
+            # Braking starts a step after the observation: v²/2a + v dt + a dt²/2 ≤ way. The last bit fades out.
             braked = limits.acceleration * limits.control_step
             fading = FADE * (far / limits.control_step).clamp(max=braked)
             fastest = fastest.minimum(((2.0 * limits.acceleration * far).sqrt() - braked).maximum(fading))
@@ -54,9 +54,9 @@ class PointPlanner(StaticPlannerModule):
         return tensordict
 
     def arrival_model(self) -> PointArrival:
-        """When it is at a goal; ``robot_state`` is to begin with place and velocity."""
+        """Model of its arrival times; ``robot_state`` must begin with position and velocity."""
         return self.limits
 
     def part_settings(self) -> dict[str, Any]:
-        """Arguments that make the same planner."""
+        """Constructor arguments of this planner."""
         return self.limits.part_settings()

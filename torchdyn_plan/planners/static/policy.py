@@ -20,12 +20,12 @@ from torchdyn_plan.planners.static.base import StaticPlannerModule
 
 
 class Held(NamedTuple):
-    """An action that holds for some steps; its names below ``plan`` begin with ``policy_``."""
+    """An action held for some steps; its names under ``plan`` begin with ``policy_``."""
 
     action: Tensor
     """``(*B, A)``."""
     age: Tensor
-    """``(*B,)`` int64 control steps for which it has held, 0 when a new one is due."""
+    """``(*B,)`` int64 control steps for which it has been held, 0 when a new one is due."""
     goal: Tensor
     """``(*B, 3)`` for which it was chosen [m, world]."""
 
@@ -36,8 +36,8 @@ HELD_NAMES = tuple(f"policy_{field}" for field in Held._fields)
 class PolicyPlanner(StaticPlannerModule):
     """Static planner π_g(s^R): reads ``robot_state`` and ``goal``, writes ``action`` (paper, Section III-A).
 
-    With a ``period`` above 1 an action holds for so many control steps, unless the goal changes; what it has to
-    remember for that it keeps in the tensordict under ``plan``.
+    With a ``period`` above 1 an action is held for that many control steps, unless the goal changes; the memory for
+    this is in the tensordict under ``plan``.
     """
 
     comes_to_rest = False
@@ -49,9 +49,9 @@ class PolicyPlanner(StaticPlannerModule):
 
         Args:
             actor: maps robot states ``(*B, S)`` and goals ``(*B, 3)`` [m, world] to actions ``(*B, A)``.
-            period: control steps for which an action holds.
-            approach: how far the tool reaches: a goal beyond, which the actor never saw, is brought to the edge. None
-                to leave goals as they are.
+            period: control steps for which an action is held.
+            approach: gives the tool's reach: a goal beyond it, which the actor was not trained on, is moved to the
+                edge. None to leave goals unchanged.
             chunk: act in blocks of exactly this many rows, so that results do not depend on the batch size.
         """
         super().__init__()
@@ -66,9 +66,9 @@ class PolicyPlanner(StaticPlannerModule):
 
     @classmethod
     def from_pretrained(cls, name_or_path: str | Path, **settings: Any) -> PolicyPlanner:
-        """Planner with the actor that ships under a name, or is in a file or folder; raises `WeightsError`.
+        """Planner with a shipped actor, or one from a file or folder; raises `WeightsError`.
 
-        ``settings`` are the constructor's.
+        ``settings`` are arguments of the constructor.
         """
         return cls(Actor.from_pretrained(name_or_path).requires_grad_(False), **settings)
 
@@ -88,7 +88,7 @@ class PolicyPlanner(StaticPlannerModule):
         return tensordict
 
     def empty_memory(self, like: Tensor) -> dict[str, Tensor]:
-        """The entries of rows that hold no action, as `Remembering` says."""
+        """The entries of rows without a held action, see `Remembering`."""
         if self.period == 1:
             return {}
         action = like.new_zeros(*like.shape[:-1], self.actor.config.action_size)
@@ -96,7 +96,7 @@ class PolicyPlanner(StaticPlannerModule):
         return dict(zip(HELD_NAMES, Held(action, age, torch.zeros_like(like)), strict=True))
 
     def part_settings(self) -> dict[str, Any]:
-        """Arguments that make the same planner."""
+        """Constructor arguments of this planner."""
         return {name: getattr(self, name) for name in ("actor", "period", "approach", "chunk")}
 
     def _act(self, state: Tensor, goal: Tensor) -> Tensor:
@@ -107,7 +107,7 @@ class PolicyPlanner(StaticPlannerModule):
         return apply_to_rows(lambda *seen: (self.actor(*seen),), every, (state, goal), (like,), chunk=self.chunk)[0]
 
     def _recall(self, tensordict: TensorDictBase, goal: Tensor) -> tuple[Tensor, Tensor]:
-        """Action (*B, A) that holds and its age (*B,), 0 where a new one is due."""
+        """The held action (*B, A) and its age (*B,), 0 where a new one is due."""
         plan = tensordict.get(keys.PLAN, None)
         stored: dict[str, Any] = {} if plan is None else dict(plan.items())
         fresh = read(tensordict, keys.STEP_COUNT, "PolicyPlanner").reshape(goal.shape[:-1]) == 0

@@ -1,4 +1,4 @@
-"""The trivial static planner of a tool that is pulled along each axis: straight at the goal, slower when near."""
+"""Proportional controller as a static planner: straight to the goal, slower near it."""
 
 from __future__ import annotations
 
@@ -15,14 +15,14 @@ from torchdyn_plan.planners.static.base import StaticPlannerModule
 
 
 class ProportionalController(StaticPlannerModule):
-    """Pulls the tool towards ``goal``: action = gain · (goal - tool), each axis cut to ±1.
+    """Drives the tool towards ``goal``: action = gain · (goal - tool), each axis clamped to ±1.
 
     Reads ``tool_pos`` (*B, D) and ``goal`` (*B, D) [m, world], writes ``action`` (*B, ``action_size``), whose further
-    entries are 0. It remembers nothing, and a row's action depends on that row alone, whatever the batch.
+    entries are 0. It has no memory, and a row's action depends on that row only.
     """
 
     def __init__(self, *, gain: float, action_size: int | None = None) -> None:
-        """Pull with ``gain`` [1/m]; the first D of ``action_size`` entries, D for None, are along its axes."""
+        """Use ``gain`` [1/m]; the first D of ``action_size`` entries are the axes. None for ``action_size`` = D."""
         super().__init__()
         check_number("gain", gain, minimum=0.0)
         if action_size is not None:
@@ -45,5 +45,5 @@ class ProportionalController(StaticPlannerModule):
         return tensordict
 
     def part_settings(self) -> dict[str, Any]:
-        """Arguments that make the same planner."""
+        """Constructor arguments of this planner."""
         return {"gain": self.gain, "action_size": self.action_size}

@@ -1,4 +1,4 @@
-"""Along a path of poses: joint positions within the limits of place and speed, a step of time after the other."""
+"""Joint trajectories along a path of poses, within position and speed limits, one time step after another."""
 
 from __future__ import annotations
 
@@ -18,28 +18,28 @@ from torchdyn_plan.kinematics.targets import as_pose, as_rows, is_pose
 from torchdyn_plan.precision import without_autocast
 
 TIGHT = 0.1
-"""Share of the tolerances at which a step ends, so that a slow target is followed and not stepped after."""
+"""Share of the tolerances at which a step ends, so that a slow target is followed smoothly."""
 PATIENCE = 5
-"""Steps after which a row that does not come to its target looks for another way to it, each time."""
+"""Number of steps without reaching the target after which a row searches for another solution."""
 RESTARTS = (1, 16)
-"""Starts of such a search."""
+"""Starts of that search."""
 FULL_SPEED = 0.999
-"""Share of its speed limit from which a joint counts as being at it."""
+"""Share of its speed limit from which a joint counts as moving at full speed."""
 
 
 class _State(NamedTuple):
-    """Where each row stands."""
+    """State of each row."""
 
     q: Tensor
     """``(M, N)``, the joints."""
     reference: Tensor
-    """``(M, N)``, where they are going to while they change over."""
+    """``(M, N)``, their goal while they change over to another solution."""
     changing: Tensor
     """``(M,)`` bool: on the way to another solution."""
     late: Tensor
     """``(M,)`` int64, steps since the joints were at the target."""
     target: Tensor
-    """``(M, 4, 4)``, the last pose that was one."""
+    """``(M, 4, 4)``, the last valid pose."""
 
 
 def follow(
@@ -55,31 +55,31 @@ def follow(
     iterations: int = 8,
     posture: Tensor | None = None,
 ) -> IKResult:
-    """Joint positions that follow ``poses`` from ``q0`` on, within the limits of place and of speed at every step.
+    """Joint positions that follow ``poses`` from ``q0``, within position and speed limits at every step.
 
-    At every step the joints go as near to the pose as can be reached in ``dt``: first by what the target has moved (its
-    velocity, fed forward) and what was left before, then by what corrects that. Of the motions that would do, slow
-    joints take less. A joint at a limit, of place or of speed, is left out, and the others do the work. A row that
-    does not come to its target for `PATIENCE` steps changes over to the nearest other solution, straight and as fast
-    as its slowest joint allows, while the target moves on.
+    At every step the joints move as close to the pose as possible within ``dt``: first by the target's motion (velocity
+    feed-forward) plus the remaining error, then by corrections. Slow joints are weighted to move less. A joint at a
+    position or speed limit is left out, and the others do the work. A row that does not reach its target for `PATIENCE`
+    steps changes over to the nearest other solution, in a straight line and as fast as its slowest joint allows, while
+    the target moves on.
 
     Args:
-        arm: whose tool it is. Joints without a speed limit are as fast as they like.
-        poses: ``(*B, T, 4, 4)``, base frame [m], the first to be reached after ``dt``; ``(*B, T, 3)`` will do for the
+        arm: the arm. Joints without a speed limit may move arbitrarily fast.
+        poses: ``(*B, T, 4, 4)``, base frame [m], the first to be reached after ``dt``; or ``(*B, T, 3)`` for the
             constraint "position".
-        q0: ``(*B, N)`` or ``(N,)``, the joints before the first step. From outside their limits they come back as fast
-            as they can, and no step is `SOLVED` before they have.
+        q0: ``(*B, N)`` or ``(N,)``, the joints before the first step. If they are outside their limits they return as
+            fast as possible, and no step is `SOLVED` before that.
         dt: time of a step [s].
-        constraint: as of `solve_ik`.
-        symmetry: as of `solve_ik`.
+        constraint: see `solve_ik`.
+        symmetry: see `solve_ik`.
         position_tolerance: [m]
         rotation_tolerance: [rad]
-        iterations: most steps towards each pose.
-        posture: ``(*B, N)`` or ``(N,)``, to which the motion that the constraint leaves free is drawn.
+        iterations: most iterations for each pose.
+        posture: ``(*B, N)`` or ``(N,)``, preferred joint positions in the null space of the constraint.
 
     Returns:
-        As of `solve_ik`, with the time before the last dimensions: ``q`` (*B, T, N), ``status`` (*B, T), and
-        ``residual`` (*B, T, 2). At an invalid pose the joints stay; the row continues after it.
+        As `solve_ik`, with the time dimension after the batch: ``q`` (*B, T, N), ``status`` (*B, T), and ``residual``
+        (*B, T, 2). At an invalid pose the joints stay; the row continues after it.
 
     Raises:
         InputError: a shape, device, precision, name or number is wrong.
@@ -102,7 +102,7 @@ def follow(
 
 
 def following(arm: Arm, constraint: str, symmetry: int, tolerances: tuple[float, float], iterations: int) -> Search:
-    """A search of poses that are yet to come."""
+    """A search whose target poses are set later."""
     speed, none = speeds(arm), arm.lower.new_zeros(0, 4, 4)
     step = torch.ones_like(speed)
     ease = None if bool((speed == speed[0]).all()) else speed / speed.max()
@@ -113,7 +113,7 @@ def following(arm: Arm, constraint: str, symmetry: int, tolerances: tuple[float,
 def follow_rows(
     search: Search, poses: Tensor, start: Tensor, reach: Tensor, *, patience: int = PATIENCE
 ) -> tuple[Tensor, Tensor, Tensor]:
-    """`follow` for rows: ``poses`` (M, T, 4, 4) from ``start`` (M, N), by at most ``reach`` (N,) a step."""
+    """`follow` for rows: ``poses`` (M, T, 4, 4) from ``start`` (M, N), at most ``reach`` (N,) per step."""
     count, steps, joints = len(start), poses.shape[1], start.shape[1]
     q, residual = start.new_empty(count, steps, joints), start.new_empty(count, steps, 2)
     status = torch.empty(count, steps, dtype=torch.int64, device=start.device)
@@ -134,7 +134,7 @@ def follow_rows(
 def _advance(  # noqa: PLR0917  # One step of a loop over all of them.
     search: Search, state: _State, target: Tensor, valid: Tensor, reach: Tensor, patience: int
 ) -> _State:
-    """The state one step of time later."""
+    """The state one time step later."""
     search = search._replace(target=torch.where(valid[:, None, None], target, state.target))
     q, reference, changing, late = (value.clone() for value in state[:4])
     rows = (valid & ~changing).nonzero().squeeze(-1)
@@ -159,7 +159,7 @@ def _tight(search: Search) -> Search:
 
 
 def _follow_on(search: Search, q: Tensor, rows: Tensor, reach: Tensor) -> tuple[Tensor, Tensor]:
-    """The nearest to the target that one step from ``q`` (A, N) reaches, and whether it is there, ``(A,)``."""
+    """The closest to the target that one step from ``q`` (A, N) reaches, and whether it is reached, ``(A,)``."""
     most = _within(q, reach)
     lower, upper = torch.maximum(search.arm.lower, q - most), torch.minimum(search.arm.upper, q + most)
     part = _rows_of(search, rows)._replace(lower=lower, upper=upper)
@@ -175,27 +175,27 @@ def _another_way(search: Search, q: Tensor, rows: Tensor) -> tuple[Tensor, Tenso
 
 
 def _rows_of(search: Search, rows: Tensor) -> Search:
-    """The search of some rows alone."""
+    """The search restricted to some rows."""
     posture = None if search.posture is None else search.posture[rows]
     weights = None if search.weights is None else search.weights[rows]
     return search._replace(target=search.target[rows], posture=posture, weights=weights)
 
 
 def _within(q: Tensor, reach: Tensor) -> Tensor:
-    """The most that joints at ``q`` (*B, N) move: ``reach`` (N,), less what rounding may add."""
+    """Largest step of joints at ``q`` (*B, N): ``reach`` (N,) minus a margin for rounding."""
     eps = torch.finfo(q.dtype).eps
     return (reach - 4.0 * eps * (q.abs() + reach.nan_to_num(posinf=0.0))).clamp_min(0.0)
 
 
 def _towards(q: Tensor, reference: Tensor, reach: Tensor) -> Tensor:
-    """``q`` (M, N) moved to ``reference`` (M, N), or on the straight way there by at most ``reach`` (N,)."""
+    """``q`` (M, N) moved in a straight line towards ``reference`` (M, N), by at most ``reach`` (N,)."""
     way = reference - q
     worst = (way.abs() / _within(q, reach).clamp_min(torch.finfo(q.dtype).tiny)).amax(dim=-1, keepdim=True)
     return torch.where(worst <= 1.0, reference, q + way / worst.clamp_min(1.0))
 
 
 def _told(search: Search, state: _State, before: Tensor, valid: Tensor, reach: Tensor) -> tuple[Tensor, Tensor]:
-    """Status ``(M,)`` and residual ``(M, 2)`` of where the joints have come from ``before`` (M, N)."""
+    """Status ``(M,)`` and residual ``(M, 2)`` after a step from ``before`` (M, N)."""
     search = search._replace(target=state.target)
     every = torch.arange(len(valid), device=valid.device)
     q = torch.where(valid.unsqueeze(-1), state.q, state.reference)

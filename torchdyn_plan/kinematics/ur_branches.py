@@ -1,4 +1,4 @@
-"""All solutions of an arm of the UR family, analytically: three parallel axes, and neighbours elsewhere that cross.
+"""All IK solutions of a UR arm in closed form: three parallel axes, and all other neighbouring axes intersect.
 
 The chain is brought to Denavit and Hartenberg's form T = Rz(q₁)Rx(½π) Rz(q₂)Tx(a₂) Rz(q₃)Tx(a₃) Rz(q₄)Tz(d₄)Rx(½π)
 Rz(q₅)Tz(d₅)Rx(-½π) Rz(q₆) between a constant base and a constant tool, and solved as by Hawkins (Analytic Inverse
@@ -23,25 +23,25 @@ from torchdyn_plan.kinematics.targets import as_pose, as_rows, is_pose
 from torchdyn_plan.precision import without_autocast
 
 NUMBER = 8
-"""Solutions of a pose at most: two of the shoulder, each with two of the wrist, each with two of the elbow."""
+"""Most solutions of a pose: two of the shoulder, each with two of the wrist, each with two of the elbow."""
 EXACT = 1e-5
-"""Sine of the angle of axes that are parallel, and distance [m] of those that cross, at most."""
+"""Largest sine of the angle between parallel axes, and largest distance between intersecting ones [m]."""
 SLACK = 0.6
-"""Power of the precision by which an angle may be outside its limits, to be brought back [rad].
+"""An angle outside its limits by at most eps to this power is clamped [rad].
 
-Near singular positions, angles are known by the square root of the precision alone.
+Near singular positions, angles are only accurate to the square root of eps.
 """
 BLOCK = 64
-"""Rows of one product of matrices: a fixed number, so that a row's answer does not depend on its company."""
+"""Rows per matrix product: a fixed number, so that a row's result does not depend on the batch."""
 
 
 class Branches(NamedTuple):
     """All solutions of each pose."""
 
     q: Tensor
-    """``(*B, 8, 6)`` [rad]; finite, and of no meaning where not valid."""
+    """``(*B, 8, 6)`` [rad]; finite but meaningless where not valid."""
     valid: Tensor
-    """``(*B, 8)`` bool: it reaches the pose, within the limits. Two may be the same, in a singular configuration."""
+    """``(*B, 8)`` bool: reaches the pose within the limits. In a singular configuration two may be equal."""
 
 
 class Universal(NamedTuple):
@@ -60,21 +60,21 @@ class Universal(NamedTuple):
 
 
 def branches(arm: Arm, target: Tensor, *, q0: Tensor | None = None, differentiable: bool = False) -> Branches:
-    """All joint positions of an arm of the UR family at which its tool is at ``target``.
+    """All joint positions of a UR arm at which its tool is at ``target``.
 
     Args:
-        arm: six joints that turn; axes 2, 3 and 4 are parallel, 1 and 2, 4 and 5, 5 and 6 cross at right angles.
+        arm: six revolute joints; axes 2, 3 and 4 are parallel, 1 and 2, 4 and 5, 5 and 6 intersect at right angles.
         target: ``(*B, 4, 4)``, base frame [m].
-        q0: ``(*B, 6)`` or ``(6,)``, to which joints are turned by 2π within their limits, and whose last joint is kept
-            where axes 4 and 6 are in line; the middle of the limits by default.
-        differentiable: give ``q`` derivatives in ``target`` and the arm's own tensors, see `implicit.refine`.
+        q0: ``(*B, 6)`` or ``(6,)``; joints are turned by 2π towards it within their limits, and its last joint is kept
+            if axes 4 and 6 are in line. The middle of the limits by default.
+        differentiable: give ``q`` gradients with respect to ``target`` and the arm's tensors, see `implicit.refine`.
 
     Raises:
-        InputError: the arm is another, or a shape, device or precision is wrong.
+        InputError: the arm is not a UR arm, or a shape, device or precision is wrong.
     """
     form = universal(arm)
     if isinstance(form, str):
-        raise InputError(f"branches handles arms of the UR family alone: {form}")
+        raise InputError(f"branches handles arms of the UR family only: {form}")
     target = as_pose(target, arm, "pose")
     batch = target.shape[:-2]
     with torch.no_grad():
@@ -109,7 +109,7 @@ def all_branches(  # noqa: PLR0917  # All are needed.
     lower, upper = (limit.reshape(-1, 6).T.unsqueeze(1).contiguous() for limit in (lower, upper))
     start = start.T.contiguous().unsqueeze(1)
     angles, solvable = _angles(form, target, (sign * start + offset)[5, 0])
-    # Of who is at a limit, rounding alone may lead outside.
+    # For a joint at its limit, rounding alone may lead outside.
     slack, valid = torch.finfo(target.dtype).eps ** SLACK, solvable
     q = turned_towards((angles - offset) * sign, start, lower - slack, upper + slack)
     for column, least, most in zip(q, lower - slack, upper + slack, strict=True):
@@ -119,7 +119,7 @@ def all_branches(  # noqa: PLR0917  # All are needed.
 
 
 def tool_turns(target: Tensor, symmetry: int) -> Tensor:
-    """The poses ``(M, symmetry, 4, 4)`` that are the same to a tool that is so after a ``symmetry``-th of a turn."""
+    """The poses ``(M, symmetry, 4, 4)`` that are equivalent for a tool with this rotational symmetry about z."""
     angle = torch.arange(symmetry, dtype=torch.float64) * (2.0 * math.pi / symmetry)
     turns = torch.eye(4, dtype=torch.float64).repeat(symmetry, 1, 1)
     turns[:, 0, 0], turns[:, 0, 1], turns[:, 1, 0], turns[:, 1, 1] = angle.cos(), -angle.sin(), angle.sin(), angle.cos()
@@ -136,7 +136,7 @@ def _angles(form: Universal, target: Tensor, last: Tensor) -> tuple[Tensor, Tens
     (x1, y1, z1, px), (x2, y2, z2, py), (x3, y3, _, pz) = _entries(form, target)
     sides = target.new_tensor([1.0, -1.0]).unsqueeze(-1)
 
-    # The wrist's centre lies d₄ aside of the plane in which the arm bends: s₁ px - c₁ py = d₄.
+    # The wrist centre lies at distance d₄ from the plane in which the arm bends: s₁ px - c₁ py = d₄.
     reach = px * px + py * py
     square = reach - shoulder**2
     root, reach = sides * square.clamp_min(0.0).sqrt(), reach.clamp_min(eps**2)
@@ -181,7 +181,7 @@ def _angles(form: Universal, target: Tensor, last: Tensor) -> tuple[Tensor, Tens
 
 
 def _angle(sine: Tensor, cosine: Tensor) -> Tensor:
-    """The angle of (cosine, sine), of any length; `torch.atan2` rounds differently with the place of a row."""
+    """The angle of (cosine, sine), of any length; the rounding of `torch.atan2` depends on a row's position."""
     length = (sine * sine + cosine * cosine).sqrt()
     tangent = sine / (length + cosine.abs()).clamp_min(torch.finfo(sine.dtype).tiny)
     back, angle = cosine < 0, 2.0 * tangent.atan()
@@ -201,7 +201,7 @@ def _entries(form: Universal, target: Tensor) -> list[list[Tensor]]:
 def _universal(joints: list[Joint], tool: Tensor) -> Universal | str:
     """Constants of a chain, or why it is not of the family."""
     if len(joints) != 6 or any(joint.kind != "revolute" for joint in joints):
-        return f"it has {len(joints)} joints of kinds {', '.join(joint.kind for joint in joints)}, not 6 that turn"
+        return f"it has {len(joints)} joints of kinds {', '.join(joint.kind for joint in joints)}, not 6 revolute ones"
     if any(joint.coupling is not None for joint in joints):
         return "some of its joints move together"
     axes, places, end = _lines(joints, tool)
@@ -213,7 +213,7 @@ def _universal(joints: list[Joint], tool: Tensor) -> Universal | str:
         if (axes[first] @ axes[second]).abs() > EXACT:
             return f"its axes {first + 1} and {second + 1} are not at right angles"
         if (way @ torch.linalg.cross(axes[first], axes[second])).abs() > EXACT:
-            return f"its axes {first + 1} and {second + 1} do not cross"
+            return f"its axes {first + 1} and {second + 1} do not intersect"
     return _constants(axes, places, end)
 
 
