@@ -178,7 +178,7 @@ def test_torchrls_own_macro_actions_run_by_it():
 @pytest.mark.parametrize(
     ("make", "message"),
     [
-        (lambda: ArmSolver("ur5"), "arm must be an Arm, such as Arm.ur5\(\) or Arm.from_urdf\(...\), got str"),
+        (lambda: ArmSolver("ur5"), r"arm must be an Arm, such as Arm.ur5\(\) or Arm.from_urdf\(...\), got str"),
         (lambda: ArmSolver(ARM, base=[[1.0]]), r"base must be a pose of shape \(4, 4\), got"),
         (lambda: ArmSolver(ARM, base=torch.zeros(4, 4)), r"base must be a pose of shape \(4, 4\), got"),
         (lambda: ArmSolver(ARM, base=torch.eye(4, dtype=torch.int64)), r"base must be a pose of shape \(4, 4\)"),
