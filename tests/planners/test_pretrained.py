@@ -401,7 +401,7 @@ DAMAGE = [
     (put("search", {"wrong": 1}), "search of .*cannot be made"),
     (network_of("torchdyn_plan.nets.forecaster:Forecaster"), "eta of .*ETANetwork"),
     (network_of("torchdyn_plan.planners.search.exact:ExactSearch"), "eta of .*no part"),
-    (put("chunk", {"dtype": "load"}), "chunk of .*torch.load is no type"),
+    (put("chunk", {"dtype": "load"}), "chunk of .*torch.load is not a dtype"),
     (put("chunk", "many"), "chunk.*many"),
     (put("latency", 3), "latency"),
     (lambda content: content["parts"].pop("eta"), "eta"),
