@@ -400,7 +400,7 @@ DAMAGE = [
     (search_of(3), "search of "),
     (put("search", {"wrong": 1}), "search of .*cannot be made"),
     (network_of("torchdyn_plan.nets.forecaster:Forecaster"), "eta of .*ETANetwork"),
-    (network_of("torchdyn_plan.planners.search.exact:ExactSearch"), "eta of .*no part"),
+    (network_of("torchdyn_plan.planners.search.exact:ExactSearch"), "eta of .*not a part"),
     (put("chunk", {"dtype": "load"}), "chunk of .*torch.load is not a dtype"),
     (put("chunk", "many"), "chunk.*many"),
     (put("latency", 3), "latency"),
