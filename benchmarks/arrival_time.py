@@ -1,8 +1,8 @@
-"""How long joints take to be somewhere: the closed form beside Ruckig, in time and in what it says.
+"""Arrival times of joints: the closed form compared with Ruckig, in speed and in result.
 
     python benchmarks/arrival_time.py --out benchmarks/results/arrival_time.json
 
-Ruckig is a library of its own, ``pip install ruckig``; without it only our times are measured.
+Ruckig is a separate library, ``pip install ruckig``; without it only our times are measured.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""How far joints pass their speed limits when a ball is trapped, and what gentler drops would cost.
+"""How far joints exceed their speed limits when a ball is trapped, and what gentler drops would cost.
 
 python benchmarks/braking.py --episodes 300 --out benchmarks/results/braking.json
 """

@@ -1,7 +1,7 @@
-"""What any schedule could trap: each solvable episode tried with many meeting and drop times, the truth known.
+"""Ceiling of success: each solvable episode is tried with many meeting and drop times, with the true future known.
 
-A schedule waits above the place where the ball will truly be at step t and lets the box down some steps before, either
-there or after the ball. It starts at step 13, as planners do, and is simulated. The ceiling is the share of solvable
+A schedule waits above the ball's true position at step t and drops the box some steps earlier, either there or
+following the ball. It starts at step 13, like the planners, and is simulated. The ceiling is the share of solvable
 episodes that at least one schedule traps.
 
 python benchmarks/ceiling.py --out benchmarks/results/ceiling.json

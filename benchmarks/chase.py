@@ -1,4 +1,4 @@
-"""Chase with thousands of rows: how many are met, how near the best possible time, and how long a step takes.
+"""Chase with thousands of rows: share met, time compared with the optimum, and duration of a step.
 
 python benchmarks/chase.py --out benchmarks/results/chase.json
 """

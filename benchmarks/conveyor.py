@@ -1,4 +1,4 @@
-"""Parts taken off a belt: of those that can be taken at all, how many are, at each speed and with several at once.
+"""Parts picked off a belt: share of the solvable parts taken, at each belt speed and with several parts at once.
 
 python benchmarks/conveyor.py --out benchmarks/results/conveyor.json
 """

@@ -1,11 +1,11 @@
-"""How far one act travels through the package: calls of its functions, files they stand in, and changes of file.
+"""Length of a step's path through the package: calls of its functions, their files, and changes of file.
 
     python benchmarks/count_calls.py --out calls.json --list
 
-Counted is every call of a Python function or method that is defined in ``torchdyn_plan``, as ``sys.setprofile`` reports
-them while the act runs. Comprehensions, generator expressions and lambdas are not counted, as they have no name to be
-looked up by; nor is what PyTorch, TensorDict, TorchRL or MuJoCo do in between. A change of file is counted where a call
-stands in another file than the call before it.
+Every call of a Python function or method defined in ``torchdyn_plan`` is counted, as reported by ``sys.setprofile``.
+Comprehensions, generator expressions and lambdas are not counted, because they have no name to look up; nor are calls
+inside PyTorch, TensorDict, TorchRL or MuJoCo. A change of file is counted if a call is in another file than the
+previous call.
 """
 
 from __future__ import annotations

@@ -1,9 +1,8 @@
 """Descriptions of robots as packages ship them, URDF and MJCF: which are read, and how far pose and Jacobian are off.
 
-The references are MuJoCo for MJCF and pinocchio for URDF. Of every file some tips are read, the ends of its longest
-chains and others evenly between; where a joint lies on the way that no arm can have (a free one), the base is the body
-behind it, as the error says. A file that the reference cannot read
-either is refused with an error, which its row has.
+The references are MuJoCo for MJCF and pinocchio for URDF. Several tips of every file are read: the ends of its longest
+chains, and others evenly between. If the chain contains an unsupported joint (a free one), the base is the body after
+it, as the error suggests. A file that the reference cannot read either is refused, and its row has the error.
 
 pip install pin example-robot-data gymnasium-robotics robosuite robosuite_models dm_control gym-aloha dexmate-urdf
 python benchmarks/descriptions.py --out benchmarks/results/descriptions.json

@@ -1,10 +1,10 @@
-"""What each of our deviations from the paper is worth to the paper's own planner: taken back alone.
+"""Effect of each of our deviations from the paper on the paper's own planner: each is undone alone.
 
 python benchmarks/deviations.py --out benchmarks/results/deviations.json
 
-The forecaster is told where the cushions are and that the table is symmetric, the policy learns on goals that change in
-mid-episode, and the planner by inverse kinematics hovers, drops and lifts by construction. For each of these, ours and
-the paper's way are trained here with the same data, steps and seed, and the same planners play the same episodes.
+The forecaster is given the cushions and the symmetry of the table, the policy learns on goals that change during an
+episode, and the IK planner hovers, drops and lifts by construction. For each of these, our version and the paper's are
+trained here with the same data, steps and seed, and the same planners play the same episodes.
 """
 
 from __future__ import annotations

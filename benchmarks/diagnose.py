@@ -1,7 +1,7 @@
-"""Where corner search loses balls: each learned part in turn replaced by the truth.
+"""Where corner search loses balls: each learned part is replaced by the truth in turn.
 
 Forecast: the network's, or the ball's recorded path. Arrival: the network's, or measured by driving copies of the
-arm. What is still lost with both true is lost by the search and by the static planner's timing.
+arm. Losses that remain with both true are caused by the search and the static planner's timing.
 
     python benchmarks/diagnose.py --out benchmarks/results/diagnose.json
 """

@@ -1,16 +1,17 @@
-"""A tool that follows a smooth target: jumps of the joints, limits of place and speed, beside a warm-started solver.
+"""A tool that follows a smooth target: joint jumps, position and speed limits, compared with a warm-started solver.
 
     git worktree add /tmp/former 930dcd6
     python benchmarks/following.py --former /tmp/former --out following.json
 
-Each target is a tool's pose along smooth joint motions, sums of sines within the limits of place and at up to half of
-those of speed: so each can be followed all along without a jump. Whoever follows is given the poses and the first joint
-positions. ``follow`` is asked as it is, and once more without speed limits, so that it may jump; ``solve_ik`` is asked
-at every step, from its last answer. With ``--tool``, the tool itself moves by sums of sines, and part of the paths
-cannot be followed.
+Each target is a tool's pose along smooth joint motions, sums of sines within the position limits and at up to half of
+the speed limits, so each can be followed without a jump. The solvers get the poses and the first joint positions.
+``follow`` is run normally, and once more without speed limits, so that it may jump; ``solve_ik`` is called at every
+step, from its last answer. With ``--tool`` the tool itself moves by sums of sines, and some of the paths cannot be
+followed.
 
 ``jumps`` is the share of paths in which a joint moves by more than 0.8 rad in one step; ``detours`` the share in which
-a joint is more than 0.8 rad on when the target, lost for some steps, is reached again: a jump within speed limits.
+a joint has moved by more than 0.8 rad when the target is reached again after being lost for some steps: a jump within
+speed limits.
 """
 
 from __future__ import annotations

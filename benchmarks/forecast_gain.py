@@ -1,7 +1,7 @@
-"""What a better forecast gains: the wait-and-drop planner as it is, certain of its forecast, or foretold the truth.
+"""What a better forecast gains: the wait-and-drop planner unchanged, certain of its forecast, or given the true future.
 
-The truth is simulated on from the ball as it is, touched or not, with its own friction. Every planner plays the same
-episodes, so that differences to the first are paired.
+The true future is simulated from the ball's present state, touched or not, with its own friction. All planners play the
+same episodes, so that differences to the first are paired.
 
     python benchmarks/forecast_gain.py --velocity 3 --friction 9.5 --out benchmarks/results/forecast_gain.json
 """

@@ -1,11 +1,11 @@
-"""Latency of a plan and of the steps around it, of this checkout and of another one, side by side in one run.
+"""Latency of a plan and of the steps around it, in this checkout and in another one, in one run.
 
     git worktree add /tmp/former 65afd9a
     python benchmarks/former_latency.py --former /tmp/former --out latency.json
 
-Either checkout runs in processes of its own, on one thread. Both are timed block by block in turn, on the same recorded
-observations at batch 1, so that whatever else the machine does hits both alike. A ratio is the median over pairs of
-blocks of this checkout's median over the other's.
+Each checkout runs in its own processes, on one thread. Both are timed in alternating blocks, on the same recorded
+observations at batch 1, so that other load on the machine affects both equally. A ratio is the median, over pairs of
+blocks, of this checkout's median divided by the other's.
 """
 
 from __future__ import annotations

@@ -1,7 +1,7 @@
-"""One side of `former_latency.py`: times what it is told to in whatever checkout it is started on, over a pipe.
+"""One side of `former_latency.py`: runs timings in the checkout it is started in, on request over a pipe.
 
-Lines of JSON come in and go out. It knows the planners' interface of today, and that of the last checkout before tasks
-became folders (65afd9a), whose wait-and-drop planner was called `MeetingPlanner`.
+Requests and answers are lines of JSON. It supports the planners' current interface, and that of the last checkout
+before tasks became folders (65afd9a), whose wait-and-drop planner was called `MeetingPlanner`.
 """
 
 from __future__ import annotations

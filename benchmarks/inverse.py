@@ -1,11 +1,11 @@
-"""Inverse kinematics of many arms: solved share, limits, and CPU time beside a former checkout's.
+"""Inverse kinematics of many arms: solved share, limits, and CPU time compared with a former checkout.
 
     git worktree add /tmp/former 930dcd6
     python benchmarks/inverse.py --former /tmp/former --out inverse.json
 
-Targets are poses of random joint positions within the limits, starts are other such positions. Other starts are outside
-their limits and at the target already: 7 rad away, or by 1e-4 rad. The two checkouts solve the same in turn, in
-processes of their own on one thread; the CPU time is the least of ``repeats``.
+Targets are poses of random joint positions within the limits, and starts are other such positions. Further starts are
+at the target but outside the limits, by 7 rad or by 1e-4 rad. The two checkouts solve the same problems in turn, in
+their own processes on one thread; the CPU time is the minimum of ``repeats``.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""How fast the joints turn while a planner drives them, as a share of their limit, apart from contacts.
+"""Joint speeds while a planner drives the arm, as a share of their limit, without contacts.
 
 python benchmarks/joint_speeds.py --out benchmarks/results/joint_speeds.json
 """

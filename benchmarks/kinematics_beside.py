@@ -1,9 +1,9 @@
-"""`torchdyn-plan bench kinematics` beside a former checkout's, in turn and in processes of their own, on one thread.
+"""`torchdyn-plan bench kinematics` compared with a former checkout, in turn, in separate processes on one thread.
 
     git worktree add /tmp/former 930dcd6
     python benchmarks/kinematics_beside.py --former /tmp/former --out kinematics_beside.json
 
-Other libraries are measured in the process of this checkout. Each figure is the least of the rounds' medians.
+Other libraries are measured in the process of this checkout. Each figure is the minimum of the rounds' medians.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""What latency costs: the same episodes with plans that come late, to planners that allow for it or do not.
+"""Cost of planning latency: the same episodes with delayed plans, compensated or not.
 
 python benchmarks/latency.py --split test --episodes 1000 --out benchmarks/results/latency/results.json
 """

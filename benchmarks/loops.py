@@ -1,11 +1,11 @@
-"""Whether a planner plans and succeeds the same in every loop that TorchRL and PyTorch have.
+"""Whether a planner gives the same results in every kind of loop in TorchRL and PyTorch.
 
     python benchmarks/loops.py --out benchmarks/results/loops.json
 
-Every loop plays the same episodes, half of them in each of two environments side by side, or in two environments of one
-process. ``same`` is the share of episodes whose outcome and number of plans are those of the plain loop. Batches of
-another size round matrix products in another way, and a compiled planner fuses operations: what hangs on the last bit
-may differ, so that the rule is equality of all but a few episodes in a hundred, and of the means.
+Every loop plays the same episodes, half of them in each of two parallel environments, or in two environments of one
+process. ``same`` is the share of episodes with the same outcome and number of plans as in the plain loop. Batches of
+another size round matrix products differently, and a compiled planner fuses operations, so a few episodes may differ;
+the test is that all but a few in a hundred, and the means, are equal.
 """
 
 from __future__ import annotations

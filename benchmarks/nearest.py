@@ -1,12 +1,12 @@
-"""The nearest solution, on the UR5: beside the nearest of all analytic solutions; and what `branches` costs.
+"""The nearest IK solution on the UR5, compared with the nearest of all analytic solutions; and the cost of `branches`.
 
     pip install eaik
     git worktree add /tmp/former 930dcd6
     python benchmarks/nearest.py --former /tmp/former --out nearest.json
 
-EAIK finds all solutions of each target; each is turned by 2π to the nearest of the start within the limits, and the
-nearest of them is the one whose slowest joint arrives first. An answer is the nearest where it takes at most 0.01 s
-longer; ``extra`` is how much longer it takes on average, ``worst`` at most [s].
+EAIK finds all solutions of each target; each is shifted by 2π to be nearest to the start within the limits, and the
+nearest of them is the one whose slowest joint arrives first. An answer counts as nearest if it takes at most 0.01 s
+longer; ``extra`` is the mean extra time, ``worst`` the largest [s].
 """
 
 from __future__ import annotations

@@ -2,11 +2,11 @@
 
 python benchmarks/paper_scene.py --out benchmarks/results/paper_scene.json
 
-The search is a coordinate descent: it starts from the shipped scene, tries other values of one number after the other,
-and keeps a value that comes nearer to the paper. In each candidate, arrival times are collected and learned anew for
-the inverse kinematics, as the paper has them (none is *never*), and the forecaster too where the ball rolls otherwise.
-Then pursuit, corner and oracle play `dev` episodes over the paper's velocities and friction losses, and are held
-against its curves for IK, with the solvable share. Our own planners, the learned policy and `test` are not looked at.
+The search is a coordinate descent: it starts from the shipped scene, tries other values of one number after another,
+and keeps a value that comes nearer to the paper. For each candidate, arrival times are collected and trained again for
+IK, as in the paper (without *never*), and so is the forecaster if the ball rolls differently. Then pursuit, corner and
+oracle play `dev` episodes over the paper's velocities and friction losses, and are compared with its curves for IK and
+its solvable share. Our own planners, the learned policy and `test` are not used.
 """
 
 from __future__ import annotations

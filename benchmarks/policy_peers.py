@@ -1,9 +1,9 @@
-"""Policies that learn by trial with hindsight, ours beside Stable-Baselines3's: success on the same resting balls.
+"""Policies trained with hindsight replay, ours and Stable-Baselines3's: success on the same resting balls.
 
 python benchmarks/policy_peers.py --minutes 5 --out benchmarks/results/policy_peers.json   # needs the extra `peer`
 
 The peers are SAC and TQC with the settings that RL Baselines3 Zoo tuned for FetchReach, given our features of state and
-goal, our goals and our products of matrices. Every run has one thread. Rows are runs; a killed study goes on.
+goal, our goals and our matrix products. Every run has one thread. Rows are runs; a killed study continues.
 """
 
 from __future__ import annotations

@@ -3,7 +3,7 @@
 python benchmarks/reach_at_rest.py --out benchmarks/results/reach/at_rest.json
 
 The Zoo publishes -1.66 ± 0.87 over 3,000 episodes of its TQC (benchmark.md, FetchReach-v1). Our policy was trained for
-1 cm, not for 5: that it stays nearer to the goal earns nothing here.
+1 cm, not for 5: staying closer to the goal gains nothing here.
 """
 
 from __future__ import annotations

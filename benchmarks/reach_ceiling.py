@@ -1,8 +1,9 @@
 """Which moving goals of Reach can be reached at all, and in which variant of the task the paper's curve is possible.
 
-With the goal's whole path known, the gripper is pulled from the first step on to where the goal will be at some step,
-for every step that is not out of the question; the ceiling is the share of episodes in which it is met so, verified by
-simulation. The bound counts episodes whose goal is at some step no farther than the gripper could move along each axis.
+With the goal's whole path known, the gripper is driven from the first step to the goal's position at some step, for
+every step that is not impossible; the ceiling is the share of episodes in which this meets the goal, verified by
+simulation. The bound counts episodes whose goal is, at some step, within the distance the gripper could have moved
+along each axis.
 
 python benchmarks/reach_ceiling.py --out benchmarks/results/reach_ceiling.json
 """

@@ -1,7 +1,7 @@
-"""How fast Reach runs beside gymnasium-robotics' FetchReach, the same actions in turn, and how far they differ.
+"""Speed of Reach compared with gymnasium-robotics' FetchReach under the same actions, and how far they differ.
 
-The original is mended as in the tests (its helpers fail with mujoco 3.17 and later) and runs its copies one after the
-other in Gymnasium's `SyncVectorEnv`.
+The original is patched as in the tests (its helpers fail with mujoco 3.17 and later) and runs its copies one after
+another in Gymnasium's `SyncVectorEnv`.
 
 python benchmarks/reach_env.py --out benchmarks/results/reach_env.json
 """

@@ -2,8 +2,8 @@
 
     python benchmarks/same_episodes.py runs/before runs/after
 
-Each argument is a folder of folders with ``episodes.json``, or one such folder; folders of one name are compared. Wall
-times do not count. Results from before planners and tasks had their present names are read by those they have now.
+Each argument is a folder of folders with ``episodes.json``, or one such folder; folders of the same name are compared.
+Wall times are ignored. Former names of planners and tasks are translated to their present ones.
 """
 
 from __future__ import annotations

@@ -1,9 +1,9 @@
-"""When to plan anew: success against what planning costs, for schedules of every kind.
+"""When to plan again: success and planning cost for different schedules.
 
     python benchmarks/schedules.py --out benchmarks/results/schedules.json
 
-Cost: plans and looks (an event-triggered schedule's, one arrival pass each) of an episode, times what one of them takes
-on one thread for one robot. How long they take is measured at the end of a run, for all rows in the file alike.
+Cost: the number of plans and checks in an episode (an event-triggered schedule's checks, one arrival pass each), times
+the duration of one on one thread for one robot. Durations are measured at the end of a run, for all rows in the file.
 """
 
 from __future__ import annotations

@@ -1,10 +1,10 @@
-"""What sensors cost, and what tracks and forecasters win back: on the same episodes.
+"""What sensors cost, and what tracks and forecasters recover, on the same episodes.
 
     python benchmarks/sensors.py --split test --episodes 1000 --out benchmarks/results/sensors.json
 
 Each row is one sensor, one velocity and one planner; ``success_solvable`` is over the episodes that can be solved.
-``held`` is the planner that is shown the newest measurement, held from step to step; the others see by a track that is
-told the sensor's noise. A killed run goes on where it was, so that rows can be added a few at a time.
+``held`` is the planner that sees the newest measurement, held from step to step; the others have a track set to the
+sensor's noise. A killed run continues where it was, so that rows can be added a few at a time.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""Two checkouts of this package side by side: each answers in a process of its own, on one thread."""
+"""Comparison of two checkouts of this package: each runs in its own process, on one thread."""
 
 from __future__ import annotations
 

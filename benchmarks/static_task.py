@@ -1,4 +1,4 @@
-"""The static task: how many of the balls that lie still, and that the arm can cover, the static planner traps.
+"""The static task: share of the resting balls within the arm's reach that the static planner traps.
 
 python benchmarks/static_task.py --out benchmarks/results/static_task.json
 """

@@ -1,7 +1,7 @@
-"""What all studies of this folder share: arguments, rows that a killed run keeps, and the file that they end in.
+"""Common code of the studies in this folder: arguments, rows that survive a kill, and the result file.
 
-A study is a script that measures rows, one after the other. Each row is identified by what it depends on, and saved
-before it is printed: a run that was killed goes on where it was, and a closed terminal loses nothing.
+A study is a script that measures rows one after another. Each row is identified by what it depends on, and is saved
+before it is printed: a killed run continues where it was, and a closed terminal loses nothing.
 """
 
 from __future__ import annotations

@@ -1,9 +1,9 @@
-"""What a track costs: a measurement taken in, none taken in, and the past and present that a forecaster reads.
+"""Cost of a track: a step with a measurement, a step without, and the history and covariance for a forecaster.
 
     python benchmarks/track.py --out benchmarks/results/track.json
 
-``operation`` is one addition of two tensors of a number a row, measured beside: what any operation costs on the machine
-at that moment. On a shared machine the ratio to it says more than microseconds do.
+``operation`` is one addition of two tensors with one number per row, measured at the same time, as the cost of any
+operation on the machine at that moment. On a shared machine the ratio to it is more meaningful than microseconds.
 """
 
 from __future__ import annotations

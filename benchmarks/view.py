@@ -1,9 +1,9 @@
-"""The page in the browser: how often it is sent while somebody watches, and what a step of it costs.
+"""The page in the browser: its update rate with a client, and the cost of a step.
 
 python benchmarks/view.py --out benchmarks/results/view.json
 
-A client that takes in everything, as a browser does, is connected while the page plays; the page itself sends at most
-40 steps a second. ``ms_per_step`` is the processor time of all threads of a step of the page that is sent to nobody.
+A client that receives everything, like a browser, is connected while the page plays; the page sends at most 40 steps a
+second. ``ms_per_step`` is the processor time, over all threads, of a step without a client.
 """
 
 from __future__ import annotations

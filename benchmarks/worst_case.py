@@ -1,10 +1,10 @@
-"""The longest that a planner keeps a control loop waiting: very many re-plans, one at a time, on one thread.
+"""Worst-case latency of a planner: very many re-plans, one at a time, on one thread.
 
 python benchmarks/worst_case.py --out benchmarks/results/worst_case.json
 
-A call is a whole planner step in which a plan is due, of one row. A call that takes longer than a control step by the
-clock on the wall, but not by the time that its thread was running, was interrupted by the machine. How often the
-machine does so is measured beside: a loop that does nothing spins between the blocks of calls, and its gaps count.
+A call is a whole planner step of one row in which a plan is due. A call that takes longer than a control step in wall
+time, but not in processor time, was interrupted by the machine. How often this happens is measured separately: an empty
+loop spins between the blocks of calls, and its gaps are counted.
 """
 
 from __future__ import annotations

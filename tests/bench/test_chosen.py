@@ -68,8 +68,8 @@ def test_a_planner_acts_in_the_task_that_it_belongs_to_unless_another_is_asked_f
 @pytest.mark.parametrize(
     ("given", "message"),
     [
-        ({}, "name one planner at least"),
-        ([], "name one planner at least"),
+        ({}, "name at least one planner"),
+        ([], "name at least one planner"),
         (3, "'planner' is int"),
         ({"number": 3}, "'number' is int"),
         (IKPlanner, "'planner' is the class IKPlanner"),

@@ -336,7 +336,7 @@ def test_planners_stay_as_they_were():
     [
         ({"device": "gpu"}, "device 'gpu' cannot be used"),
         ({"device": "meta"}, "device 'meta' cannot be used"),
-        ({"batches": ()}, "batches must name one number of rows at least"),
+        ({"batches": ()}, "batches must name at least one number of rows"),
         ({"batches": (1, 0)}, "batches must be >= 1, got 0"),
         ({"seconds": -1.0}, "seconds must be >= 0"),
         ({"threads": -1}, "threads must be >= 0"),

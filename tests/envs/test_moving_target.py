@@ -93,5 +93,5 @@ def test_a_world_without_a_word_for_success_is_refused():
     class Mute(PointEnv):
         flags = ()
 
-    with pytest.raises(InputError, match=r"Mute\.flags must name at least what success is called"):
+    with pytest.raises(InputError, match=r"Mute\.flags must name at least the flag of success"):
         Mute()

@@ -87,7 +87,7 @@ def test_a_planner_of_another_scene_is_refused():
         ({"planners": ["persuit"]}, "unknown planner of drift 'persuit' .did you mean 'pursuit'"),
         ({"planners": {}}, "planners must name at least one of pursuit"),
         ({"planners": ["pursuit", "pursuit"]}, "planners must be named once each, got pursuit pursuit"),
-        ({"planners": {"mine": run_to}, "weights": "here"}, "weights are of planners that are named"),
+        ({"planners": {"mine": run_to}, "weights": "here"}, "weights apply to planners given by name"),
         ({"static": "push"}, "unknown static planner of drift 'push'"),
         ({"drift": 2.0}, r"drift must be in \[0, 1\], got 2.0"),
         ({"speed": 2.0}, "unknown setting of drift 'speed'"),

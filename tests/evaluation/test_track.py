@@ -96,9 +96,9 @@ def test_a_sweep_goes_through_the_track(tmp_path):
 def test_a_planner_that_has_a_track_or_can_have_none_is_refused():
     planner = SENSED.planner("pursuit")
     tracked = TrackedPlanner(planner, TRACK, control_step=SENSED.control_step)
-    with pytest.raises(InputError, match="planner 'mine' has a track of its own"):
+    with pytest.raises(InputError, match="planner 'mine' already has a track"):
         evaluate(SENSED, {"mine": tracked}, track=TRACK, **QUIET)
-    with pytest.raises(InputError, match="planner 'mine' is no planner of this package"):
+    with pytest.raises(InputError, match="planner 'mine' is not a planner of this package"):
         evaluate(SENSED, {"mine": lambda td: td}, track=TRACK, **QUIET)
 
 

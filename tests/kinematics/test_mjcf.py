@@ -191,7 +191,7 @@ def test_meshes_and_included_files_are_found_beside_the_description(folder):
     for source in (file, str(file), mujoco.MjSpec.from_file(str(file))):
         assert torch.equal(Arm.from_mjcf(source, tip="tool")(q), expected(q))
     assert Path.cwd() == here
-    with pytest.raises(InputError, match=r"opening file 'arm.xml'.*files are looked for beside the description"):
+    with pytest.raises(InputError, match=r"opening file 'arm.xml'.*files are searched for in the description.s folder"):
         Arm.from_mjcf(file.read_text(), tip="tool")
 
 

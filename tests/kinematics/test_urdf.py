@@ -329,8 +329,8 @@ def test_a_tool_comes_behind_the_tip():
     ("tool", "message"),
     [
         (torch.eye(3), r"tool must have shape \(4, 4\), got \(3, 3\)"),
-        (2.0 * torch.eye(4), "tool must be a rotation and a place"),
-        (torch.diag(torch.tensor([1.0, 1, -1, 1])), "tool must be a rotation and a place"),
+        (2.0 * torch.eye(4), "tool must be a rotation and a position"),
+        (torch.diag(torch.tensor([1.0, 1, -1, 1])), "tool must be a rotation and a position"),
         (torch.full((4, 4), math.nan), "tool must be finite"),
         ("flange", r"tool must be a pose \(4, 4\) of numbers, got 'flange'"),
     ],

@@ -92,10 +92,10 @@ def test_a_planner_with_it_is_saved(arm, tmp_path):
 @pytest.mark.parametrize(
     ("change", "message"),
     [
-        ({"speed": [1.0] * 5}, "speed and acceleration must be of as many joints, got 5 and 6"),
+        ({"speed": [1.0] * 5}, "speed and acceleration must have equally many joints, got 5 and 6"),
         ({"speed": [0.0] * 6}, "speed must be a positive number for each joint"),
         ({"acceleration": [float("inf")] * 6}, "acceleration must be a positive number for each joint"),
-        ({"joints": print}, "joints must have goal_joints, as an IKPlanner, got builtin_function_or_method"),
+        ({"joints": print}, "joints must have goal_joints, like an IKPlanner, got builtin_function_or_method"),
         ({"slowdown": 0.0}, "slowdown must be >= 0.001, got 0.0"),
     ],
 )

@@ -104,5 +104,5 @@ def test_an_arm_is_where_its_planner_says_when_it_says():
 
 @pytest.mark.parametrize("named", [CallablePlanner(lambda state, goal: goal), lambda td: td])
 def test_one_that_does_not_is_asked_for_it(named):
-    with pytest.raises(InputError, match=f"eta is needed, as {type(named).__name__} has no arrival_model"):
+    with pytest.raises(InputError, match=f"eta is needed, because {type(named).__name__} has no arrival_model"):
         DynamicPlanner(named)

@@ -130,7 +130,7 @@ def test_weights_of_a_policy_are_taken_and_noted(tmp_path):
         ({"what": "arrivals", "static": "ik"}, InputError, "unknown static planner of toy 'ik'"),
         ({"episodes": 0}, InputError, "episodes must be >= 1, got 0"),
         ({"seed": -1}, InputError, "seed must be >= 0"),
-        ({"weights": "there"}, InputError, "weights are of the task's own static planner"),
+        ({"weights": "there"}, InputError, "weights are for the task's own static planner"),
         ({"what": "arrivals", "static": "learned", "weights": "nowhere"}, WeightsError, "no weights 'nowhere'"),
         ({"task": replace(TASK, record_paths=None)}, InputError, "toy records no paths"),
         ({"what": "arrivals", "task": replace(TASK, record_arrivals=None)}, InputError, "toy records no arrivals"),
@@ -147,7 +147,7 @@ def test_what_cannot_be_collected_is_named_and_nothing_is_written(tmp_path, sett
 
 def test_weights_for_a_planner_that_has_none_are_refused(tmp_path):
     weights = Actor(SIZES).save_pretrained(tmp_path / "policy")
-    with pytest.raises(InputError, match="weights are of a policy, but straight of toy is none"):
+    with pytest.raises(InputError, match="weights are for a policy, but straight of toy is not one"):
         gather(tmp_path, "arrivals", weights=weights)
 
 
@@ -271,7 +271,7 @@ def test_a_shard_whose_numbers_were_changed_is_refused(tmp_path):
     content = bytearray(file.read_bytes())
     content[-1] ^= 1
     file.write_bytes(content)
-    with pytest.raises(InputError, match=r"paths-0-000.* is damaged: it holds something else than was written"):
+    with pytest.raises(InputError, match=r"paths-0-000.* is damaged: it differs from what was written"):
         load_paths(tmp_path)
 
 

@@ -105,7 +105,7 @@ def kill_at_step(monkeypatch, count):
 @pytest.mark.parametrize(("fit", "stem"), [(fit_forecaster, "paths"), (fit_eta, "arrivals")])
 def test_data_of_another_scene_or_without_description_is_named(data, tmp_path, fit, stem):
     describe(data, stem, digest="0123")
-    with pytest.raises(InputError, match=f"{stem}-0.json' tells of scene 0123, but the scene is"):
+    with pytest.raises(InputError, match=f"{stem}-0.json' is of scene 0123, but the scene is"):
         fit_with(fit, data, tmp_path)
     (data / f"{stem}-0.json").write_text("{")
     with pytest.raises(InputError, match=f"{stem}-0.json' is no JSON file"):

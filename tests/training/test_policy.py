@@ -200,7 +200,7 @@ def test_damaged_tensors_are_named(tmp_path: Path, trained: bytes, prefix: str) 
     tensors = load_file(file)
     cut = {name: value[:1] if name.startswith(prefix) and value.ndim else value for name, value in tensors.items()}
     save_file(cut, file, safe_open(file, framework="pt").metadata())
-    with pytest.raises(TrainingError, match=r"checkpoint\.safetensors' holds something else than was written"):
+    with pytest.raises(TrainingError, match=r"checkpoint\.safetensors' differs from what was written"):
         fit_policy(PointTask(), tmp_path, recipe=SHORT, score_every=1)
 
 

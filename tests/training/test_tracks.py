@@ -71,7 +71,7 @@ def test_parquet_is_read_where_pyarrow_is_and_asked_for_where_it_is_not(tmp_path
         read_tracks(tmp_path / "tracks.parquet")
     monkeypatch.undo()
     pyarrow = pytest.importorskip("pyarrow")
-    with pytest.raises(InputError, match="is no Parquet file"):
+    with pytest.raises(InputError, match="is not a Parquet file"):
         read_tracks(tmp_path / "tracks.parquet")
     rows, *_ = samples()
     table = pyarrow.table({name: [row[place] for row in rows] for place, name in enumerate(HEADER)})
@@ -138,9 +138,9 @@ BAD = {
     "two of a kind": (spoiled(header=("t", "x", "y", "time", "track")), "has several columns for time: time, t"),
     "empty": (text("a.csv", b""), "lacks a column time"),
     "header alone": (text("a.csv", b"time,x,y\n"), "holds no samples"),
-    "not text": (text("a.csv", b"\xff\xfe\x00time"), "is no CSV"),
+    "not text": (text("a.csv", b"\xff\xfe\x00time"), "is not a CSV"),
     "other": (text("a.xlsx", b""), "must be one of .csv, .parquet, .npy, .npz"),
-    "no array": (text("a.npy", b"what"), "is no NumPy file"),
+    "no array": (text("a.npy", b"what"), "is not a NumPy file"),
     "three columns": (array("a.npy", np.zeros((5, 3))), r"must have shape \(n, 4\), .* got \(5, 3\)"),
     "in an array": (
         array("a.npy", np.array([[0, 0, 0, 0], [1, np.nan, 0, 0.0]])),

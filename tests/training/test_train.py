@@ -80,7 +80,7 @@ def test_networks_for_measured_targets_are_trained_by_sensors_and_a_track(data, 
     sighting = Sighting(passes=1, each=4, steps=25, sensors=SensorRange(slowest=5.0, fastest=10.0), regimes=regimes)
     fitting = replace(TASK.fitting(), noisy_forecaster=config, sighting=sighting)
     task = replace(TASK, fitting=lambda: fitting)
-    with pytest.raises(InputError, match="toy has no forecaster for targets that are measured with noise"):
+    with pytest.raises(InputError, match="toy has no forecaster for noisy measurements"):
         train(TASK, "noisy_forecaster", data, tmp_path)
     file = train(task, "noisy_forecaster", data, tmp_path, steps=4, batch=8)
     assert file == tmp_path / "noisy_forecaster" / "forecaster.safetensors"
@@ -126,10 +126,10 @@ def test_a_learning_rate_is_the_critics_and_the_actors_in_proportion():
     ("network", "settings", "message"),
     [
         ("forcaster", {}, r"unknown network of toy 'forcaster' \(did you mean 'forecaster'\?\)"),
-        ("eta", {"num_envs": 4}, "num_envs is of policies, which learn by trial: eta has none, got 4"),
-        ("forecaster", {"workers": 2}, "workers is of policies"),
-        ("eta", {"options": LearnOptions()}, "options is of policies"),
-        ("eta", {"algorithm": "ddpg"}, "algorithm is of policies"),
+        ("eta", {"num_envs": 4}, "num_envs is for policies only: eta has none, got 4"),
+        ("forecaster", {"workers": 2}, "workers is for policies only"),
+        ("eta", {"options": LearnOptions()}, "options is for policies only"),
+        ("eta", {"algorithm": "ddpg"}, "algorithm is for policies only"),
         ("policy", {"algorithm": "sac"}, "unknown algorithm 'sac'; choose from averaged, ddpg"),
         ("eta", {"steps": 0}, "steps must be >= 1"),
         ("policy", {"options": 3}, "options of policy must be LearnOptions, got int"),

@@ -1,1 +1,1 @@
-"""What ``torchdyn-plan bench`` runs: the latency of plans, the rate of environments, and kinematics beside others'."""
+"""Benchmarks of ``torchdyn-plan bench``: latency of plans, rate of environments, kinematics compared with others."""

@@ -1,4 +1,4 @@
-"""Which planners are timed: given, named, found in a folder or a module; and in which task each of them acts."""
+"""Selection of the planners to time: given, named, or found in a folder or a module; and the task of each."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from torchdyn_plan.planners import DynamicPlanner, ExactSearch, shipped_planners
 from torchdyn_plan.tasks import DEFAULT, Task, import_place, load_task, task_names
 
 COARSE = 4
-"""Of an exact search that is also timed from coarse to fine."""
+"""Coarseness of the exact searches that are also timed from coarse to fine."""
 ONE = "planner"
 """Name of a planner that was given without one."""
 
@@ -29,23 +29,23 @@ class Chosen(NamedTuple):
 
     planner: Planner
     task: Task
-    """In whose environment it acts."""
+    """The task in whose environment it acts."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class Source:
-    """Where planners come from that are only named."""
+    """Source of planners given by name."""
 
     task: Task | None = None
-    """In which all planners act; None for the one to whose scene each belongs."""
+    """The task in which all planners act; None for the task of each planner's scene."""
     static: str | None = None
-    """Name of the static planner on which the task's own are built; None for its default one."""
+    """Static planner on which the task's planners are built; None for the default one."""
     weights: str | Path | None = None
-    """Folder of the networks of the task's own; None for those that ship."""
+    """Folder of the networks of the task's planners; None for the shipped ones."""
 
     @property
     def home(self) -> Task:
-        """The task whose planners are known by their names alone, and in which those act that belong nowhere."""
+        """The task of planners given by bare names, and of planners without a scene."""
         return self.task or load_task(DEFAULT)
 
     def choose(self, planner: Choice | None) -> dict[str, Chosen]:
@@ -69,7 +69,7 @@ class Source:
         else:
             found = {ONE: planner}
         if not found:
-            raise InputError("name one planner at least, got none")
+            raise InputError("name at least one planner, got none")
         for name, one in found.items():
             if isinstance(one, type) or not callable(one):
                 kind = f"the class {one.__name__}" if isinstance(one, type) else type(one).__name__
@@ -77,7 +77,7 @@ class Source:
         return found
 
     def _find(self, name: Any) -> Planner:
-        """The planner of that name: the task's, one that ships, in a folder, or at ``package.module:NAME``."""
+        """The planner of that name: the task's, a shipped one, in a folder, or at ``package.module:NAME``."""
         if not isinstance(name, str | Path):
             raise InputError(f"planners must be names, or a mapping of names to planners, got {type(name).__name__}")
         name, task = str(name), self.home
@@ -92,7 +92,7 @@ class Source:
         return DynamicPlanner.from_pretrained(name)
 
     def _defaults(self) -> dict[str, Planner]:
-        """The task's default planners that plan on what is seen, and exact searches from coarse to fine."""
+        """The task's default planners that make plans, and exact searches from coarse to fine."""
         task, found = self.home, {}
         for name in task.default_planners:
             planner = task.planner(name, self.static, weights=self.weights)
@@ -103,11 +103,11 @@ class Source:
             if isinstance(search, ExactSearch) and search.coarse == 1 and search.probability_weight == 0.0:
                 found[f"{name}, coarse to fine"] = planner.with_parts(search=replace(search, coarse=COARSE))
         if not found:
-            raise InputError(f"no default planner of {task.name} plans again and again: name one")
+            raise InputError(f"no default planner of {task.name} makes plans: name one")
         return found
 
     def _task_of(self, planner: Planner) -> Task:
-        """The task that was asked for, else the one to whose scene ``planner`` belongs, else the default one."""
+        """The requested task, else the task of the planner's scene, else the default one."""
         scene = getattr(planner, "scene", None)
         if self.task is not None or scene in (None, self.home.digest()):
             return self.home
@@ -115,7 +115,7 @@ class Source:
 
 
 def _import_planner(place: str) -> Planner:
-    """The planner at ``package.module:NAME``, or what the function there makes of nothing."""
+    """The planner at ``package.module:NAME``, or the result of the function there."""
     found = import_place(place, "planner")
     is_maker = inspect.isfunction(found) and not inspect.signature(found).parameters
     maker: Callable[[], Any] = found
@@ -123,7 +123,7 @@ def _import_planner(place: str) -> Planner:
 
 
 def _tasks_in_all_scenes() -> Iterator[Task]:
-    """Every task that is known by its name, in each of its scenes."""
+    """Every registered task, in each of its scenes."""
     for name in task_names():
         try:
             task = load_task(name)
@@ -133,7 +133,7 @@ def _tasks_in_all_scenes() -> Iterator[Task]:
 
 
 def _scene_of(task: Task) -> str | None:
-    """Hash of the scene of ``task``; None where what it needs is not installed."""
+    """Hash of the scene of ``task``; None if a library it needs is not installed."""
     try:
         return task.digest()
     except (ImportError, TorchdynPlanError):

@@ -1,4 +1,4 @@
-"""Kinematics of the UR5 beside other libraries': pose and Jacobian, five damped steps, solutions; a planner's steps."""
+"""Kinematics of the UR5 compared with other libraries: pose and Jacobian, damped steps, solutions, planner steps."""
 
 from __future__ import annotations
 
@@ -48,7 +48,7 @@ def bench(
     progress: bool = True,
     show: Callable[[Row], object] | None = None,
 ) -> list[Row]:
-    """A row for each device, batch, problem and implementation: its time, and how wrong its result is.
+    """A row for each device, batch, problem and implementation, with its time and the error of its result.
 
     ``max_error`` is the greatest difference of pose and Jacobian from those in float64; for steps and solutions, of the
     pose reached from its target; for the planner's action, from that in float64.
@@ -96,11 +96,11 @@ def bench(
 plot = plot_bench
 
 Measured = Iterator[tuple[Row, Callable[[], Any], Callable[[Any], Row]]]
-"""What a row is about, what is timed, and what its result says of it."""
+"""A row's description, the timed call, and what its result adds to the row."""
 
 
 class _Own:
-    """What this package has, in float32; eager, and compiled (True) where that can be had."""
+    """This package's implementations in float32: eager, and compiled (True) if there is a compiler."""
 
     def __init__(self, device: str, planner: IKPlanner | None, *, compiled: bool) -> None:
         self.device, self.arm = device, Arm.ur5(device=device)
@@ -113,7 +113,7 @@ class _Own:
             self._compile()
 
     def _compile(self) -> None:
-        """Add what is compiled, if there is a compiler."""
+        """Add the compiled forms, if there is a compiler."""
         arm, planner = self.arm, self.planners.get(False)
         evaluate, steps = compiled_pose_and_jacobian(arm), DampedSteps(arm, damping=DAMPING, compiled=True)
         q = torch.zeros(1, arm.num_joints, device=self.device)

@@ -1,4 +1,4 @@
-"""What planners see when they are timed: taken from a task's own environment, the same at every run."""
+"""Observations for timing planners: taken from a task's own environment, the same in every run."""
 
 from __future__ import annotations
 
@@ -17,26 +17,26 @@ from torchdyn_plan.planners.memory import Remembering
 from torchdyn_plan.tasks.task import Task
 
 EPISODES = 64
-"""Episodes that are played for observations; larger batches repeat them."""
+"""Episodes played for observations; larger batches repeat them."""
 SPLIT = "dev"
-"""Their series."""
+"""Split of these episodes."""
 PURSUED_STEPS = 13
-"""Control steps for which a robot pursues its target before it is looked at."""
+"""Control steps for which a robot pursues its target before its observation is taken."""
 LOOK_STEPS = 20
-"""Control steps after all rows have planned in which a row is looked for that acts without a plan."""
+"""Control steps, after all rows have planned, in which a step without a plan is searched for."""
 
 
 class Moments(NamedTuple):
-    """What a planner sees, with its own memory in it; rows are those of some episodes."""
+    """A planner's inputs, including its memory; rows come from different episodes."""
 
     planning: TensorDict | None
-    """Where it plans; None if it never does."""
+    """Inputs at steps that plan; None if there are none."""
     between: TensorDict | None
-    """Where it acts without a plan; None if it plans at every step."""
+    """Inputs at steps that do not plan; None if it plans at every step."""
 
     @property
     def first(self) -> TensorDict:
-        """What it sees where it plans, or wherever it acts."""
+        """Inputs of a step that plans, or else of any step."""
         seen: Any = self.between if self.planning is None else self.planning
         return seen
 
@@ -53,13 +53,13 @@ class Moments(NamedTuple):
 
 
 def moments(task: Task, planner: Planner, name: str = "planner") -> Moments:
-    """What ``planner`` sees in `EPISODES` episodes of ``task`` at its default settings.
+    """Inputs of ``planner`` in `EPISODES` episodes of ``task`` at its default settings.
 
-    Of a `DynamicPlanner` each row is taken where it plans first, and where it does not plan afterwards; of any other
-    planner, which says of no step that it plans, after it has acted for some steps.
+    For a `DynamicPlanner` each row is taken at its first plan, and at a later step without a plan; for any other
+    planner, after it has acted for some steps.
 
     Raises:
-        InputError: it cannot act in the task; ``name`` is whom the message names.
+        InputError: it cannot act in the task; the message names it ``name``.
     """
     env, future = _make_env(task), _future(task, planner)
     plans = isinstance(planner, DynamicPlanner)
@@ -87,7 +87,7 @@ def moments(task: Task, planner: Planner, name: str = "planner") -> Moments:
 
 
 class _Rows:
-    """Rows of what was seen, each taken once."""
+    """Rows of inputs, each taken once."""
 
     def __init__(self) -> None:
         self.taken = torch.zeros(EPISODES, dtype=torch.bool)
@@ -98,7 +98,7 @@ class _Rows:
         return bool(self.taken.all())
 
     def add(self, seen: TensorDict, rows: Tensor) -> None:
-        """Take those of ``rows`` (E,) bool that are new."""
+        """Add the new ones of ``rows`` (E,) bool."""
         new = rows & ~self.taken
         if new.any():
             self.pieces.append(seen if new.all() else seen[new])
@@ -114,10 +114,10 @@ class _Rows:
 
 
 def _play(env: Any, planner: Planner, future: Tensor | None) -> Iterator[tuple[TensorDict, TensorDictBase]]:
-    """Step by step of at most an episode what ``planner`` sees, and the same after it acted.
+    """The inputs of ``planner`` and its outputs, step by step for at most an episode.
 
-    A planner for a static goal is sent to where the target is; the others set a goal of their own. One of another type
-    of numbers sees them in its own.
+    A planner for a static goal gets the target's position as its goal; the others set their own. Inputs are converted
+    to the planner's dtype.
     """
     tensordict, (dtype, own) = env.reset(), (torch.get_default_dtype(), _dtype(planner))
     truth = ShownTruth(planner, env, future)
@@ -135,21 +135,21 @@ def _play(env: Any, planner: Planner, future: Tensor | None) -> Iterator[tuple[T
 
 
 def _dtype(planner: Planner) -> torch.dtype | None:
-    """The type of numbers of ``planner``; None if it has none or several."""
+    """The dtype of ``planner``; None if it has none or several."""
     tensors = [*planner.parameters(), *planner.buffers()] if isinstance(planner, nn.Module) else []
     found = {tensor.dtype for tensor in tensors if tensor.is_floating_point()}
     return found.pop() if len(found) == 1 else None
 
 
 def _in_type(tensordict: Any, dtype: torch.dtype | None) -> Any:
-    """The same with its numbers in ``dtype``, or as they are for None; what counts stays whole."""
+    """The tensordict with floating-point entries in ``dtype``, unchanged for None."""
     if dtype is None:
         return tensordict
     return tensordict.apply(lambda value: value.to(dtype) if value.is_floating_point() else value)
 
 
 def _future(task: Task, planner: Planner) -> Tensor | None:
-    """Where the targets of the episodes go, ``(E, T, 3)`` [m, world], for a planner that reads it."""
+    """Future positions of the targets, ``(E, T, 3)`` [m, world], for a planner that reads them."""
     if not keys.TRUTHS & set(getattr(planner, "in_keys", ())):
         return None
     truth = find_truth(task, task.default_settings(), episodes=EPISODES, seed=0, split=SPLIT, num_threads=1)
@@ -157,13 +157,13 @@ def _future(task: Task, planner: Planner) -> Tensor | None:
 
 
 def pursued(task: Task, batch: int) -> TensorDict:
-    """``batch`` rows of what the static planner of ``task`` sees that has pursued its target for some steps."""
+    """``batch`` rows of inputs of the static planner of ``task``, after it has pursued its target for some steps."""
     env, planner = _make_env(task), TargetPursuit(task.static_planner())
     with torch.no_grad():
         tensordict = env.reset()
         for _ in range(PURSUED_STEPS):
             tensordict = env.step_and_maybe_reset(planner(tensordict))[1]
-    # The goal has moved since the last step: what the static planner remembers leads elsewhere.
+    # The goal has moved since the last step, so the static planner's memory leads elsewhere.
     return _repeated(tensordict.set(keys.GOAL, tensordict[keys.TARGET_POS]), batch)
 
 

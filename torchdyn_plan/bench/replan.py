@@ -26,13 +26,13 @@ from torchdyn_plan.threads import torch_threads
 from torchdyn_plan.versions import usable_cores
 
 BATCHES = (1, 1024)
-"""Rows that plan at once, if nobody says how many."""
+"""Default batch sizes."""
 SECONDS = 0.2
-"""Time spent on each figure, if nobody says how long [s]."""
+"""Default time spent on each figure [s]."""
 LONGEST = 3600.0
-"""Most time that may be spent on a figure [s]."""
+"""Longest time allowed for a figure [s]."""
 BLOCK = 1024
-"""Rows that are worked on at a time on a processor, if there are more."""
+"""Rows processed at a time on a CPU."""
 SINGLES = 16
 """Rows of a batch that are compared with the same rows computed one by one."""
 NO_FIGURES = ("median_us", "p95_us", "p99_us", "per_item_us", "per_second", "max_error")
@@ -57,30 +57,30 @@ def bench(
     """A row for each batch, part and implementation.
 
     A row has the latency's median, 95th and 99th percentile, the throughput ``per_second``, and ``max_error``: the
-    greatest difference from the same rows one by one, eager and with the networks as they are trained. A meeting may
-    differ much where two are as good: rounding decides. On a processor more than `BLOCK` rows are worked on in blocks.
+    largest difference from the same rows computed one by one, eager and with the original networks. A meeting may
+    differ a lot if two are equally good and rounding decides. On a CPU, more than `BLOCK` rows are processed in blocks.
 
-    Timed is what a planner itself does: its `DynamicPlanner.replan`, with its own search and models, and its steps. Of
-    a planner that is none, a baseline or one for static goals, the step alone is timed. Models and static planners that
-    several planners share are timed once; rows of parts of others than the first planner have their planner's name.
-    What cannot be measured has its ``error`` in its row, and no figures: a search in Python that does not compile.
+    The planner's own code is timed: `DynamicPlanner.replan`, with its own search and models, and its steps. For other
+    planners (baselines, planners for static goals) only the step is timed. Models and static planners shared by several
+    planners are timed once; rows of parts that differ from the first planner's carry their planner's name. A row that
+    cannot be measured has an ``error`` and no figures, for example a Python search that does not compile.
 
     Args:
-        planner: a planner, planners by name, or names: of the task's planners, of one that ships, of a folder with a
-            planner, or ``package.module:NAME``. None for the task's default ones that plan on what is seen.
-        task: what the planners see is taken from its environment; for None from that of the task to whose scene a
-            planner belongs, or the default one.
-        static: name of the static planner on which the task's planners are built; its default one for None.
-        weights: folder of the networks of the task's planners, as ``train`` leaves it; those that ship for None.
-        batches: rows that plan at once.
+        planner: a planner, planners by name, or names: of the task's planners, of a shipped one, of a folder with a
+            planner, or ``package.module:NAME``. None for the task's default planners that make plans.
+        task: task whose environment provides the observations; None for the task of each planner's scene, or the
+            default one.
+        static: static planner on which the task's planners are built; the default one for None.
+        weights: folder of the networks of the task's planners, as written by ``train``; the shipped ones for None.
+        batches: batch sizes.
         seconds: time spent on each figure.
-        threads: of torch, 0 for all cores; afterwards it has as many as before.
-        device: where planners run, ``cpu`` or ``cuda``; afterwards they are where they were.
-        compiled: also measure re-plans and networks compiled; each takes up to three compilations of a minute or less.
-        out: JSON file for the rows, written with each of them: a run that is killed leaves those that it has. Timings
-            are never continued: another run starts again.
+        threads: torch threads, 0 for all cores; restored afterwards.
+        device: where planners run, ``cpu`` or ``cuda``; restored afterwards.
+        compiled: also measure compiled re-plans and networks; each needs up to three compilations of a minute or less.
+        out: JSON file for the rows, written after each of them, so that a killed run leaves its rows. Another run
+            starts from the beginning.
         progress: show a progress bar.
-        show: is given each row once it is measured and saved.
+        show: called with each row once it is measured and saved.
 
     Raises:
         InputError: there is no such planner or device, a number is out of range, or a planner cannot act in the task.
@@ -112,16 +112,16 @@ def bench(
             # The forms share code, and count together.
             stack.enter_context(torch._dynamo.config.patch(recompile_limit=64))
         rows = _measure(chosen, batches, seconds, device, compiled=compiled, progress=progress)
-        # Whatever happens to a row, planners go back to where they were.
+        # Planners are moved back whatever happens.
         for row in stack.enter_context(closing(rows)):
             record.add(row)
     return record.end()
 
 
 def _check(batches: Sequence[int], seconds: float, threads: int, device: torch.device | str) -> None:
-    """Raise `InputError` for what is out of range."""
+    """Raise `InputError` for values out of range."""
     if not batches:
-        raise InputError("batches must name one number of rows at least, got none")
+        raise InputError("batches must name at least one number of rows, got none")
     for batch in batches:
         check_count("batches", batch)
     check_number("seconds", seconds, minimum=0.0)
@@ -141,7 +141,7 @@ def _measure(
     compiled: bool,
     progress: bool,
 ) -> Generator[Row]:
-    """The rows, one after the other."""
+    """The rows, one after another."""
     planners = {name: one.planner for name, one in chosen.items()}
     with ExitStack() as stack:
         bar = stack.enter_context(progress_bar(desc="re-plan", unit="figure", leave=False, disable=not progress))
@@ -171,7 +171,7 @@ def _measure(
 
 @contextmanager
 def _stays(planner: Planner) -> Iterator[None]:
-    """Afterwards ``planner`` is on the device on which it was."""
+    """Restores the device of ``planner`` on exit."""
     tensors = [*planner.parameters(), *planner.buffers()] if isinstance(planner, nn.Module) else []
     try:
         yield
@@ -187,7 +187,7 @@ def _move(planner: Planner, device: torch.device | str) -> None:
 
 
 def _row(form: Form, seen: Moments, error: str | None, *, batch: int, device: str, seconds: float) -> Row:
-    """Figures of one form; none, but the ``error`` that is known or comes up, where it cannot be measured."""
+    """Figures of one form, or its ``error`` if it cannot be measured."""
     place = {"batch": batch, "threads": torch.get_num_threads(), "device": device}
     if error is None:
         try:
@@ -215,7 +215,7 @@ def max_error(
     *,
     before: Callable[[], object] | None = None,
 ) -> float:
-    """Greatest difference between the first rows of a batch and what ``reference`` makes of them one by one.
+    """Largest difference between the first rows of a batch and the results of ``reference`` for them one by one.
 
     ``before`` is called before each call.
     """
@@ -230,6 +230,6 @@ def max_error(
 
 
 def _difference(one: Tensor, other: Tensor) -> float:
-    """Greatest difference: 0 between equal values, infinite ones and NaNs too, and infinite where one alone is so."""
+    """Largest difference: 0 for equal values, including infinities and NaN; infinite if only one is not finite."""
     same = (one == other) | (one.isnan() & other.isnan())
     return float((one - other).abs().nan_to_num(torch.inf, torch.inf).masked_fill(same, 0.0).max())

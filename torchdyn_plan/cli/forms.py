@@ -34,7 +34,7 @@ from torchdyn_plan.tasks import DEFAULT, Task, task_names
 FITTED = {
     "forecaster": "Fit the forecaster to paths of the target.",
     "spread": "Fit how far the forecaster is off, to paths of the target.",
-    "noisy_forecaster": "The same as forecaster for targets that are measured with noise, and seen by a track.",
+    "noisy_forecaster": "Like forecaster, for noisy measurements seen through a track.",
     "noisy_spread": "Fit how far that one is off.",
     "eta": "Fit the network of arrival times to runs of a static planner.",
     "nearest_eta": "The same as the paper has it: times until the robot is as near as it can come, and no *never*.",

@@ -51,21 +51,22 @@ class RobotReading(NamedTuple):
 class MovingTargetEnv(EnvBase):
     """N independent episodes of a robot and a target, ``batch_size [num_envs]``, simulated on the CPU.
 
-    Entries are those of `torchdyn_plan.keys` and the task's own `flags`. A task says how an episode starts (`_start`),
-    what a control step does (`_advance`), what the robot's sensors read (`_robot`), and what has happened (`_flags`);
-    by default any flag ends an episode, and the reward is 1 where the first one holds. How episode i starts must be a
-    pure function of (split, seed, i), as `torchdyn_plan.envs.episodes.draw_uniform` draws it: environments take the
-    next index when they reset, so that the same actions give bit-identical episodes whatever ``num_envs``.
+    Entries are those of `torchdyn_plan.keys` and the task's own `flags`. A task defines how an episode starts
+    (`_start`), what a control step does (`_advance`), the readings of the robot's sensors (`_robot`), and the flags
+    (`_flags`); by default any flag ends an episode, and the reward is 1 if the first one holds. The start of episode i
+    must be a pure function of (split, seed, i), for example drawn by `torchdyn_plan.envs.episodes.draw_uniform`:
+    environments take the next index when they reset, so that the same actions give bit-identical episodes for any
+    ``num_envs``.
 
-    Actions are detached, and no tensor that is returned shares memory with the environment or with another entry: it
-    may be changed in place. `state_dict` stores the position in the series; an environment that loads it restarts
-    the interrupted episodes at its next reset and continues from there.
+    Actions are detached, and no returned tensor shares memory with the environment or with another entry, so it may be
+    changed in place. `state_dict` stores the position in the series; an environment that loads it restarts the
+    interrupted episodes at its next reset and continues from there.
     """
 
     flags: ClassVar[tuple[str, ...]] = ()
     """Keys of the task's flags, bool ``(N, 1)`` each; the first one is success."""
     scene_digest: str | None = None
-    """Hash of the scene, which a planner that was made for one must share; None if there is nothing to confuse."""
+    """Hash of the scene, which must match that of a planner made for a scene; None if the task has only one."""
 
     def __init__(
         self,
@@ -91,35 +92,35 @@ class MovingTargetEnv(EnvBase):
         """Declare the keys, with nothing started yet.
 
         Args:
-            num_envs: number of episodes that run side by side.
+            num_envs: number of parallel episodes.
             state_size: size S of the robot state.
             action_size: size A of an action, each entry within ±1.
             joints: number of the robot's joints.
-            coordinates: D of every place, 2 in a plane or 3 in space.
-            static_target: the target rests, and `goal` says where.
-            seed: which series of episodes, from its first one; None for series 0 from somewhere far into it, another
-                place at every call, so that copies made without a seed play different episodes.
+            coordinates: D of every position, 2 in a plane or 3 in space.
+            static_target: the target rests at `goal`.
+            seed: which series of episodes, from its first one; None for series 0 from a random position far into it, so
+                that copies made without a seed play different episodes.
             split: ``train``, ``dev`` or ``test``: series that never share an episode.
             history: length H of `target_history`, in control steps.
             max_steps: control steps after which an episode is truncated.
-            goal_in_observation: `observation` ends with the target's place (D) [m, world] and, unless it rests, with
-                its last step (D) [m]: for scripts that show a policy nothing but `observation`.
+            goal_in_observation: append the target's position (D) [m, world] and, unless it rests, its last step (D) [m]
+                to `observation`, for scripts that pass a policy nothing else.
             render_mode: ``rgb_array`` for pictures by `render`; None for none.
-            on_bad_action: what becomes of an action that is no number: ``raise`` for an `InputError` before anything
-                moves, ``hold`` for an action of 0 in that row.
-            control_step: time between two actions [s]; a sensor needs it.
-            sensor: how the target is measured; exactly for None. With another one `target_pos` is the newest
-                measurement, `target_history` what was shown so at the last control steps, and `measured_pos`,
-                `measured_time` and `true_target_pos` are shown beside. Rewards and flags go by the truth.
-            others: trailing shape and type of each entry that `_others` shows.
-            device: where entries are shown and actions are expected; the simulation stays on the CPU.
+            on_bad_action: what to do with NaN or infinite actions: ``raise`` for an `InputError` before anything moves,
+                ``hold`` for an action of 0 in that row.
+            control_step: time between two actions [s]; needed for a sensor.
+            sensor: how the target is measured; exactly for None. With another sensor `target_pos` is the newest
+                measurement, `target_history` its values at the last control steps, and `measured_pos`, `measured_time`
+                and `true_target_pos` are added. Rewards and flags use the true position.
+            others: trailing shape and type of each entry of `_others`.
+            device: device of entries and actions; the simulation stays on the CPU.
 
         Raises:
             InputError: a number is negative, NaN or of the wrong kind, the split or the render mode is unknown, or the
                 class has no flags.
         """
         if not self.flags:
-            raise InputError(f"{type(self).__name__}.flags must name at least what success is called")
+            raise InputError(f"{type(self).__name__}.flags must name at least the flag of success")
         for name, value, minimum in (("num_envs", num_envs, 1), ("history", history, 2), ("max_steps", max_steps, 1)):
             check_number(name, value, minimum=minimum, integer=True)
         check_number("coordinates", coordinates, minimum=POINT_SIZES[0], maximum=POINT_SIZES[-1], integer=True)
@@ -135,7 +136,7 @@ class MovingTargetEnv(EnvBase):
         self._process = os.getpid()
         self._begin_series(seed)
         self._episode = torch.zeros(num_envs, dtype=torch.int64)
-        # TorchRL's StepCounter and CatFrames would do the next two, at several times the cost of a step.
+        # TorchRL's StepCounter and CatFrames would do the next two at several times the cost of a step.
         self._steps = torch.zeros(num_envs, dtype=torch.int64)
         self._trace = torch.zeros(num_envs, history, coordinates)
         self._sensing = self._make_sensing()
@@ -161,14 +162,14 @@ class MovingTargetEnv(EnvBase):
         self.done_spec = ends.to(self.device)
 
     def _make_sensing(self) -> Sensing | None:
-        """The batch's sensors; None where the target is seen exactly."""
+        """The batch's sensors; None if the target is measured exactly."""
         sensor = self.sensor
         if sensor is not None and not isinstance(sensor, Sensor):
             raise InputError(f"sensor must be a Sensor or None, got {type(sensor).__name__}")
         if sensor is None or sensor.is_exact:
             return None
         if self.static_target:
-            raise InputError("sensor must be None with static_target: a goal that rests is told, and not measured")
+            raise InputError("sensor must be None with static_target: a goal at rest is given, not measured")
         if self.control_step is None:
             raise InputError(f"{type(self).__name__} needs its control_step [s] for a sensor, got None")
         return Sensing(
@@ -181,26 +182,26 @@ class MovingTargetEnv(EnvBase):
 
     @abstractmethod
     def _start(self, rows: Tensor, episodes: Tensor) -> Tensor:
-        """Start ``episodes`` (M,) in ``rows`` (M,); returns where their targets are, ``(M, D)`` float32 [m, world]."""
+        """Start ``episodes`` (M,) in ``rows`` (M,); returns their targets' positions ``(M, D)`` float32 [m, world]."""
 
     @abstractmethod
     def _advance(self, action: Tensor) -> Tensor:
-        """Let a control step pass under ``action`` (N, A); returns where targets are then, ``(N, D)`` float32 [m]."""
+        """Simulate a control step under ``action`` (N, A); returns the targets' positions ``(N, D)`` float32 [m]."""
 
     @abstractmethod
     def _robot(self) -> RobotReading:
-        """What the robots' sensors read now."""
+        """Present readings of the robots' sensors."""
 
     @abstractmethod
     def _flags(self) -> dict[str, Tensor]:
-        """What has happened, bool ``(N,)`` for each of `flags`."""
+        """Values of the `flags`, bool ``(N,)`` each."""
 
     def _others(self) -> dict[str, Tensor]:
-        """What a task shows beside, by the keys of its ``others``; tensors that are nowhere else."""
+        """Further entries of a task, by the keys of its ``others``; tensors that are not used elsewhere."""
         return {}
 
     def true_future(self, rows: Tensor, steps: int) -> Tensor:
-        """Where the targets of ``rows`` (M,) go from now on if the robots stand still: ``(M, steps, D)`` [m, world].
+        """Future positions of the targets of ``rows`` (M,) if the robots stand still: ``(M, steps, D)`` [m, world].
 
         Entry k is k + 1 control steps ahead. It is simulated from the present state, on the CPU.
 
@@ -210,36 +211,36 @@ class MovingTargetEnv(EnvBase):
         raise InputError(f"{type(self).__name__} cannot simulate ahead")
 
     def _picture(self, row: int, width: int, height: int) -> np.ndarray[Any, Any]:
-        """A picture of environment ``row`` now, ``(height, width, 3)`` uint8, of tasks that can draw themselves."""
+        """A picture of environment ``row`` now, ``(height, width, 3)`` uint8; for tasks that support it."""
         raise InputError(f"{type(self).__name__} draws no pictures")
 
     def look(self) -> Look:
-        """How the world is drawn: for a task that says nothing else, tool and target as balls above a floor."""
+        """How the world is drawn; by default tool and target as balls above a floor."""
         from torchdyn_plan.envs.look import TARGET, TOOL, Ball, Look, bare_floor
 
         tool, target, half_side = Ball(0.04, TOOL), Ball(0.03, TARGET), 2.0
         return Look(bare_floor(half_side), distance=4.0, elevation=-50.0, half_side=half_side, tool=tool, target=target)
 
     def posture(self, row: int) -> np.ndarray[Any, Any]:
-        """Generalised positions ``(nq,)`` of environment ``row`` now, of the model of `look`."""
+        """Present generalised positions ``(nq,)`` of environment ``row``, for the model of `look`."""
         return np.zeros(0)
 
     def _reward(self, observed: Mapping[str, Tensor]) -> Tensor:
-        """Rewards ``(N, 1)`` of a step after which ``observed`` is seen: 1 where the first flag holds."""
+        """Rewards ``(N, 1)`` of a step that leads to ``observed``: 1 where the first flag holds."""
         return observed[self.flags[0]].float()
 
     def _terminated(self, observed: Mapping[str, Tensor]) -> Tensor:
-        """Whether an episode ends of itself, ``(N, 1)`` bool: where any flag holds."""
+        """Whether an episode terminates, ``(N, 1)`` bool: where any flag holds."""
         return torch.stack([observed[flag] for flag in self.flags]).any(0)
 
     @property
     def target_pos(self) -> Tensor:
-        """Where targets are now, ``(N, D)`` [m, world]."""
+        """Present positions of the targets, ``(N, D)`` [m, world]."""
         return self._trace[:, -1]
 
     @property
     def step_count(self) -> Tensor:
-        """Control steps since the reset, ``(N,)`` int64; in `_advance` those before the one that passes."""
+        """Control steps since the reset, ``(N,)`` int64; in `_advance`, without the step being simulated."""
         return self._steps
 
     def start_from(self, episode: int) -> None:
@@ -255,21 +256,21 @@ class MovingTargetEnv(EnvBase):
 
     @property
     def num_envs(self) -> int:
-        """Number of episodes that run side by side."""
+        """Number of parallel episodes."""
         return self.batch_size[0]
 
     def check_planner(self, planner: Callable[..., Any]) -> None:
         """Raise `InputError` if ``planner`` was made for another scene, by the digest in its ``scene``."""
-        # Any function may be a planner: only those that belong to a scene say so.
+        # Any function may be a planner; only planners made for a scene have a digest.
         scene = getattr(planner, "scene", None)
         if self.scene_digest is not None and isinstance(scene, str) and scene != self.scene_digest:
             raise InputError(
                 f"the planner belongs to scene {scene}, but the environment's scene is {self.scene_digest}: make a "
-                "planner for this scene (one that is made with scene=None belongs to none)"
+                "planner for this scene (a planner made with scene=None fits any)"
             )
 
     def rollout(self, max_steps: int, policy: Callable[..., Any] | None = None, *args: Any, **kwargs: Any) -> Any:
-        """As TorchRL's; raises `InputError` for a planner of another scene (`check_planner`)."""
+        """Like TorchRL's; raises `InputError` for a planner of another scene (`check_planner`)."""
         if policy is not None:
             self.check_planner(policy)
         return super().rollout(max_steps, policy, *args, **kwargs)
@@ -289,32 +290,32 @@ class MovingTargetEnv(EnvBase):
         return np.stack([self._picture(row, width, height) for row in range(self.num_envs)])
 
     def get_extra_state(self) -> dict[str, Any]:
-        """Where the series stands, for `state_dict`: its seed, the episodes in progress, and the next one's number."""
+        """Position in the series, for `state_dict`: its seed, the episodes in progress, and the next episode."""
         return {"seed": self.seed, "next_episode": self._next_episode, "episodes": self._episode.clone()}
 
     def set_extra_state(self, state: Any) -> None:
-        """Go on with the series of ``state``: the next reset starts the episodes that were in progress again.
+        """Continue the series of ``state``: the next reset restarts the episodes that were in progress.
 
         Raises:
-            InputError: the state is of an environment with another number of episodes side by side.
+            InputError: the state is of an environment with another number of parallel episodes.
         """
         check_trailing_shape("episodes of the state", state["episodes"], self.num_envs)
         self.seed, self._next_episode = state["seed"], state["next_episode"]
         self._again.copy_(state["episodes"])
 
     def load_state_dict(self, state_dict: Any, *args: Any, **kwargs: Any) -> Any:
-        """As PyTorch's; an empty one, as a collector has of an environment that it does not ask, changes nothing."""
+        """Like PyTorch's; an empty state, as some collectors store for an environment, changes nothing."""
         return super().load_state_dict(state_dict, *args, **kwargs) if state_dict else None
 
     def _set_seed(self, seed: int | None) -> None:
-        """Start the series ``seed`` at its first episode; somewhere in series 0 for None."""
+        """Start the series ``seed`` at its first episode; for None, series 0 at a random position."""
         self._begin_series(seed)
 
     def _begin_series(self, seed: int | None) -> None:
         if seed is not None:
             check_number("seed", seed, minimum=0, integer=True)
         self.seed, self._next_episode = seed or 0, somewhere() if seed is None else 0
-        # Episodes that a row has to start again, as they were in progress when a state was saved; -1 for none.
+        # Episodes that rows must restart because they were in progress when a state was saved; -1 for none.
         self._again = torch.full((self.num_envs,), -1, dtype=torch.int64)
 
     def _take_episodes(self, rows: Tensor) -> Tensor:
@@ -348,11 +349,11 @@ class MovingTargetEnv(EnvBase):
         return self._shown(seen | ends | {"reward": self._reward(seen)})
 
     def _shown(self, entries: dict[str, Tensor]) -> TensorDictBase:
-        """``entries`` where they are shown: the one move between devices."""
+        """``entries`` on the output device: the only move between devices."""
         return TensorDict(entries, batch_size=self.batch_size, device=self.device)
 
     def _check_process(self) -> None:
-        """Raise `InputError` in another process than the environment's, as a simulation's threads survive no fork."""
+        """Raise `InputError` in another process than the environment's: a simulation's threads survive no fork."""
         if os.getpid() != self._process:
             raise InputError(
                 f"the environment was built in process {self._process}, and process {os.getpid()} uses it: build it in "
@@ -360,7 +361,7 @@ class MovingTargetEnv(EnvBase):
             )
 
     def _checked_action(self, tensordict: TensorDictBase) -> Tensor:
-        """The action (N, A); raises `InputError` where it has another shape, or holds no number and may not."""
+        """The action (N, A); raises `InputError` for a wrong shape, or a NaN if that is not allowed."""
         action = tensordict[keys.ACTION]
         check_trailing_shape(keys.ACTION, action, self.num_envs, self.action_spec.shape[-1])
         action = action.detach().cpu()
@@ -379,18 +380,18 @@ class MovingTargetEnv(EnvBase):
             self._held_trace = torch.cat([self._held_trace[:, 1:], self._sensed.held.unsqueeze(1)], dim=1)
 
     def _start_sensing(self, sensing: Sensing, rows: Tensor, episodes: Tensor, place: Tensor) -> None:
-        """Show ``rows`` (M,) the first measurements of ``episodes`` (M,), whose targets are at ``place`` (M, D)."""
+        """Give ``rows`` (M,) the first measurements of ``episodes`` (M,), whose targets are at ``place`` (M, D)."""
         first = sensing.start(rows, episodes, place, split=self.split, seed=self.seed)
         self._held_trace[rows] = first.held.unsqueeze(1)
         self._sensed = Sensed(*(old.index_copy(0, rows, new) for old, new in zip(self._sensed, first, strict=True)))
 
     @property
     def _is_over(self) -> Tensor:
-        """Whether an episode has had its steps, ``(N, 1)`` bool."""
+        """Whether an episode has reached its last step, ``(N, 1)`` bool."""
         return (self._steps >= self.max_steps).unsqueeze(-1)
 
     def step_and_maybe_reset(self, tensordict: TensorDictBase) -> tuple[TensorDictBase, TensorDictBase]:
-        """As TorchRL's, without its checks of every entry, which cost more than the step's own arithmetic."""
+        """Like TorchRL's, without its checks of every entry, which cost more than the step's own arithmetic."""
         if tensordict.device != self.device:
             tensordict = tensordict.to(self.device)
         after = self._step(tensordict)

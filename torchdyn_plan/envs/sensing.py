@@ -1,4 +1,4 @@
-"""Measurements of a batch of targets, as a sensor takes them: by episode, whatever runs beside it."""
+"""Simulated measurements of a batch of targets; an episode's measurements do not depend on the batch."""
 
 from __future__ import annotations
 
@@ -13,37 +13,37 @@ from torchdyn_plan.envs.episodes import episode_random
 from torchdyn_plan.envs.sensor import Sensor
 
 STREAM = 2
-"""Which of an episode's streams of random numbers its sensor draws from."""
+"""An episode's stream of random numbers for its sensor."""
 LOST = torch.iinfo(torch.int64).max
-"""Control step at which a lost measurement is seen."""
+"""Arrival step of a lost measurement."""
 ROUNDING = 1e-9
-"""Share of a control step that is rounding."""
+"""Share of a control step treated as rounding error."""
 
 
 class Sensed(NamedTuple):
-    """What is seen of N targets at one control step."""
+    """Measurements of N targets available at one control step."""
 
     held: Tensor
-    """``(N, D)`` float32, the newest measurement that is there [m, world]."""
+    """``(N, D)`` float32, the newest measurement available [m, world]."""
     pos: Tensor
-    """``(N, M, D)`` float32 measurements that have come with this step [m, world]; NaN in slots that stay empty."""
+    """``(N, M, D)`` float32 measurements that arrive at this step [m, world]; NaN in empty slots."""
     time: Tensor
-    """``(N, M)`` float32, when they were taken [s since the reset]; NaN in slots that stay empty."""
+    """``(N, M)`` float32, their time stamps [s since the reset]; NaN in empty slots."""
 
 
 class Sensing:
     """The sensors of N environments, with measurements that have not arrived yet.
 
-    All that is random of an episode's measurements is drawn when it starts, as a pure function of (split, seed,
-    episode): results do not depend on how many environments there are.
+    All random numbers of an episode's measurements are drawn when it starts, as a pure function of (split, seed,
+    episode), so that results do not depend on the number of environments.
     """
 
     def __init__(
         self, sensor: Sensor, num_envs: int, *, coordinates: int = 3, control_step: float, max_steps: int
     ) -> None:
-        """Lay out the memory for episodes of up to ``max_steps`` control steps of ``control_step`` [s].
+        """Allocate memory for episodes of up to ``max_steps`` control steps of ``control_step`` [s].
 
-        Places have ``coordinates`` D.
+        Positions have ``coordinates`` D.
         """
         self.sensor, self.control_step = sensor, control_step
         self.slots = sensor.slots(control_step)
@@ -58,14 +58,14 @@ class Sensing:
         self._held = torch.zeros(num_envs, coordinates)
 
     def nothing(self) -> Sensed:
-        """What is seen of targets of which nothing has been measured."""
+        """The result before any measurement."""
         shape = len(self._held), self.slots
         return Sensed(
             self._held.clone(), torch.full((*shape, self._held.shape[-1]), torch.nan), torch.full(shape, torch.nan)
         )
 
     def start(self, rows: Tensor, episodes: Tensor, place: Tensor, *, split: str, seed: int) -> Sensed:
-        """Start ``episodes`` (R,) in ``rows`` (R,); returns what is seen at once of targets at ``place`` (R, D)."""
+        """Start ``episodes`` (R,) in ``rows`` (R,) with targets at ``place`` (R, D); returns the first measurements."""
         for row, episode in zip(rows.tolist(), episodes.tolist(), strict=True):
             self._draw(row, episode_random(split, seed, episode, STREAM))
         # Jitter may take more than one measurement at the start.
@@ -78,7 +78,7 @@ class Sensing:
         return Sensed(*(value[rows] for value in self._shown(comes)))
 
     def _draw(self, row: int, draw: np.random.Generator) -> None:
-        """Draw the moments, errors and losses of all measurements of the episode that starts in ``row``."""
+        """Draw times, errors and losses of all measurements of the episode that starts in ``row``."""
         sensor, count = self.sensor, self._count
         self._error[row] = torch.from_numpy(sensor.noise * draw.standard_normal((count, self._held.shape[-1]))).float()
         moment = self._period * np.arange(count) + sensor.jitter * draw.standard_normal(count)
@@ -90,10 +90,10 @@ class Sensing:
         self._seen_step[row, 0] = 0
 
     def see(self, step_count: Tensor, before: Tensor, now: Tensor) -> Sensed:
-        """What is seen at control steps ``step_count`` (N,) of targets that were ``before`` and are ``now`` (N, D)."""
+        """Measurements available at ``step_count`` (N,), for targets moving from ``before`` to ``now`` (N, D)."""
         step = step_count.unsqueeze(-1)
         rows, number = ((self._taken_step == step) & (step > 0)).nonzero(as_tuple=True)
-        # A measurement between two control steps is of a place between the two.
+        # A measurement between two control steps is interpolated between the two positions.
         share = 1.0 - (step_count[rows] - self._time[rows, number] / self.control_step)
         share = share.masked_fill(share > 1.0 - ROUNDING, 1.0).float().unsqueeze(-1)
         place = torch.lerp(before[rows], now[rows], share)
@@ -101,7 +101,7 @@ class Sensing:
         return self._shown(self._seen_step == step)
 
     def _shown(self, comes: Tensor) -> Sensed:
-        """The measurements that come now, ``(N, count)`` bool, the last `slots` of each row."""
+        """The measurements that arrive now, ``(N, count)`` bool, the last ``slots`` of each row."""
         left = comes.long().flip(-1).cumsum(-1).flip(-1)
         rows, number = (comes & (left <= self.slots)).nonzero(as_tuple=True)
         pos = torch.full((len(comes), self.slots, self._held.shape[-1]), torch.nan)
@@ -113,7 +113,7 @@ class Sensing:
         return Sensed(self._held.clone(), pos, time)
 
     def _step_of(self, time: Tensor) -> Tensor:
-        """The control step with which what happens at ``time`` [s] is there, int64."""
+        """The first control step at or after ``time`` [s], int64."""
         return torch.ceil(time / self.control_step - ROUNDING).long()
 
     def _measured(self, place: Tensor, error: Tensor) -> Tensor:

@@ -7,7 +7,7 @@ import math
 from dataclasses import dataclass
 
 LOWEST_RATE, HIGHEST_RATE = 1.0, 10_000.0
-"""Measurements a second that a sensor may take [Hz]."""
+"""Allowed range of a sensor's rate [Hz]."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -42,20 +42,20 @@ class Sensor:
 
     @property
     def is_exact(self) -> bool:
-        """Whether it shows the truth at every control step."""
+        """Whether it reports the true position at every control step."""
         return self == type(self)()
 
     @property
     def deviation(self) -> float:
         """Standard deviation of a measurement along each axis, including quantisation [m]."""
-        # The error of rounding is uniform within half a step.
+        # The rounding error is uniform within half a step.
         return math.hypot(self.noise, self.quantisation / math.sqrt(12.0))
 
     def slots(self, control_step: float) -> int:
-        """Measurements that can arrive in a control step [s]; if jitter brings more, the first ones are lost."""
+        """Most measurements that can arrive within a control step [s]; if jitter brings more, the first are lost."""
         regular = math.ceil(control_step * (self.rate or 1.0 / control_step) - 1e-9)
         return max(regular, 1) + (3 if self.jitter else 0)
 
     def told(self) -> dict[str, float | None]:
-        """Every number by name, for files."""
+        """Its settings by name, to be stored in files."""
         return dataclasses.asdict(self)

@@ -1,4 +1,4 @@
-"""The one loop of an evaluation, whatever the task: environment, planner, and a log of what happens."""
+"""The evaluation loop for any task: environment, planner, and a log of the episodes."""
 
 from __future__ import annotations
 
@@ -20,38 +20,38 @@ from torchdyn_plan.progress import progress_bar
 from torchdyn_plan.tasks.task import Task, Truth, Verdict
 
 Planner = Callable[[TensorDictBase], TensorDictBase]
-"""Anything that writes ``action`` into a tensordict of observations, and returns it. One that reads the truth says so:
-``target_future`` or ``true_future`` is among its ``in_keys``."""
+"""Anything that writes ``action`` into a tensordict of observations, and returns it. A planner that reads the truth
+declares ``target_future`` or ``true_future`` in its ``in_keys``."""
 OFF_PATH = 0.002
-"""A target this far off its path was touched [m]."""
+"""A target this far off its path has been touched [m]."""
 RENEWED_EVERY = 5
-"""Control steps after which the future of a target that is being touched is simulated again."""
+"""Control steps after which the future of a target in contact is simulated again."""
 
 
 @dataclass(kw_only=True)
 class EpisodeLog:
-    """What has happened in each of E episodes so far; every tensor is ``(E,)``."""
+    """State of each of E episodes so far; every tensor is ``(E,)``."""
 
     success_flag: str
-    """Flag of the environment that tells success."""
+    """The environment's flag of success."""
     done: Tensor
     """Which episodes have ended, bool."""
     steps: Tensor
     """First control step at which the success flag was true, int64; -1 for none."""
     replans: Tensor
-    """How often the planner planned, int64, of episodes that have ended."""
+    """Number of plans, int64, for episodes that have ended."""
     track: dict[str, Tensor] = field(default_factory=dict)
-    """What the planner's track has counted, int64, of episodes that have ended; empty for a planner without one."""
+    """Counts of the planner's track, int64, for episodes that have ended; empty for a planner without a track."""
     flags: dict[str, Tensor]
     """The environment's other flags when the episode ended, bool, by name."""
     traces: TraceLog | None
-    """Step by step, all that was seen and planned; None if nobody asks for it."""
+    """Step-by-step records; None if they are not needed."""
     order: list[Tensor]
     """Numbers of the episodes in the order in which they ended."""
 
     @classmethod
     def empty(cls, count: int, task: Task, env: MovingTargetEnv) -> EpisodeLog:
-        """The log of ``count`` episodes of ``task`` to come in ``env``; with traces if the task judges by them."""
+        """An empty log for ``count`` episodes of ``task`` in ``env``; with traces if the task's verdict needs them."""
         no = torch.zeros(count, dtype=torch.bool)
         others = [flag for flag in env.flags if flag != task.words.success]
         return cls(
@@ -66,11 +66,11 @@ class EpisodeLog:
 
     @property
     def success(self) -> Tensor:
-        """Which episodes have been a success, bool."""
+        """Which episodes were a success, bool."""
         return self.steps >= 0
 
     def add(self, stepped: TensorDictBase) -> int:
-        """Take in one step of all environments; returns how many episodes it ended. What comes later does not count."""
+        """Add one step of all environments; returns how many episodes it ended. Later steps of those are ignored."""
         if self.traces is not None:
             self.traces.add(stepped)
         after: TensorDictBase = stepped.get("next")
@@ -107,7 +107,7 @@ class EpisodeLog:
         self.order.append(episode)
 
     def records(self) -> Iterator[tuple[Tensor, Trace]]:
-        """Records of all episodes that have ended, some at a time: their numbers ``(R,)`` and their `Trace`."""
+        """Records of all episodes that have ended, in blocks: their numbers ``(R,)`` and their `Trace`."""
         begin = 0
         for trace in [] if self.traces is None else self.traces.traces():
             count = len(trace.length)
@@ -116,7 +116,7 @@ class EpisodeLog:
 
 
 class ShownTruth:
-    """What planners that know the truth are shown of it: recordings, and how things go on from the present state."""
+    """The truth for planners that read it: recordings, and futures simulated from the present state."""
 
     def __init__(self, planner: Planner, env: MovingTargetEnv, recorded: Tensor | None) -> None:
         """Write the true paths that ``planner`` reads into ``env``, from ``recorded`` (E, T, D); nothing for None."""
@@ -125,11 +125,11 @@ class ShownTruth:
         self.env, self.recorded = env, known
         self.shows_recording = known is not None and keys.TARGET_FUTURE in read
         self.shows_future = known is not None and keys.TRUE_FUTURE in read
-        # The path that each row is on; of episodes that have just begun the recorded one.
+        # The path of each row; the recorded one for episodes that have just started.
         self._path, self._episode = None, torch.full((env.num_envs,), -1)
 
     def show(self, tensordict: TensorDictBase) -> None:
-        """Write what the planner reads of the truth into ``tensordict``."""
+        """Write the truth that the planner reads into ``tensordict``."""
         if self.recorded is None:
             return
         episode = tensordict[keys.EPISODE].clamp(max=len(self.recorded) - 1)
@@ -139,7 +139,7 @@ class ShownTruth:
             tensordict[keys.TRUE_FUTURE] = self._future(episode, tensordict)
 
     def _future(self, episode: Tensor, seen: TensorDictBase) -> Tensor:
-        """Where targets will be at the next steps, ``(N, F, D)``: F is how far recordings go beyond an episode."""
+        """Future positions of the targets, ``(N, F, D)``; F is how far recordings extend beyond an episode."""
         assert self.recorded is not None
         new, step = episode != self._episode, seen[keys.STEP_COUNT].squeeze(-1)
         if self._path is None:
@@ -147,11 +147,11 @@ class ShownTruth:
         self._path[new], self._episode = self.recorded[episode[new]], episode.clone()
         rows, length = torch.arange(len(step)), self._path.shape[1]
         off = (self._path[rows, step] - true_target(seen)).norm(dim=-1) > OFF_PATH
-        # Episodes beyond the recorded ones are played until the others have ended, and count for nothing.
+        # Episodes beyond the recorded ones run until the others have ended, and are not counted.
         counts = seen[keys.EPISODE] < len(self.recorded)
         stale = (off & counts & (step % RENEWED_EVERY == 0)).nonzero().squeeze(-1)
         if len(stale):
-            # As long as the row that has most to come needs it.
+            # As far as the row with the most remaining steps needs it.
             steps = length - 1 - int(step[stale].min())
             since = torch.arange(length) - step[stale].unsqueeze(-1) - 1
             index = since.clamp(0, steps - 1).unsqueeze(-1).expand(-1, -1, self._path.shape[-1])
@@ -183,8 +183,8 @@ def play_all(
         planner: any planner for a moving target.
         env: what it acts in, at its first episode.
         log: of the episodes to come.
-        future: ``(E, T, D)`` recorded truth, as `play` says.
-        name: shown beside the progress bar.
+        future: ``(E, T, D)`` recorded truth, see `play`.
+        name: shown with the progress bar.
         progress: show the bar.
 
     Returns:
@@ -206,9 +206,9 @@ def play_all(
 def find_truth(
     task: Task, settings: Any, *, episodes: int, seed: int, split: str, static: str | None = None, num_threads: int = 0
 ) -> Truth:
-    """What is known of episodes 0 … E-1 before anybody plays them, with the static planner of that name.
+    """Truth about episodes 0 … E-1 before they are played, for the static planner of that name.
 
-    Of a task that knows nothing beforehand all episodes count as solvable, and their future has T = 0 steps.
+    For a task without such knowledge all episodes count as solvable, and their future has T = 0 steps.
     """
     if task.truth is None:
         return Truth(torch.empty(episodes, 0, 3), torch.ones(episodes, dtype=torch.bool))
@@ -241,15 +241,15 @@ def run_episodes(
         episodes: their number E.
         seed: which series of episodes.
         split: which family of series.
-        num_envs: episodes that run side by side; does not change the outcomes.
+        num_envs: episodes that run in parallel; does not change the outcomes.
         num_threads: of the simulation, 0 for all cores; does not change the outcomes.
         sensor: how targets are measured; exactly for None.
-        name: shown beside the progress bar.
+        name: shown with the progress bar.
         progress: show the bar.
     """
     batch: dict[str, Any] = {"num_envs": min(num_envs, episodes), "seed": seed, "split": split}
     if sensor is not None and not sensor.is_exact:
-        # Only who asks for a sensor needs a task that can have one.
+        # A task must support sensors only if one is given.
         batch["sensor"] = sensor
     env = task.make_env(settings, num_threads=num_threads, **batch)
     log = EpisodeLog.empty(episodes, task, env)
@@ -269,7 +269,7 @@ def run_episodes(
 
 
 def _judge(task: Task, settings: Any, log: EpisodeLog, truth: Truth) -> Verdict:
-    """The task's verdict; of a task that gives none, that no episode has a cause."""
+    """The task's verdict; without one, no episode has a cause."""
     if task.judge is None:
         return Verdict(torch.full((len(log.done),), NO_CAUSE), {}, {})
     return task.judge(settings, log, truth)

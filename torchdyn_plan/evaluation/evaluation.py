@@ -1,4 +1,4 @@
-"""How good are planners for a moving target? The same episodes for each of them, and what came of it."""
+"""Evaluation of planners for a moving target: the same episodes for each, and their results."""
 
 from __future__ import annotations
 
@@ -22,15 +22,15 @@ from torchdyn_plan.tasks.task import Task, load_task
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Evaluation:
-    """What came of an evaluation."""
+    """Result of an evaluation."""
 
     task: Task
     rows: list[ResultRow]
     """A row for each planner."""
     outcomes: dict[str, EpisodeOutcomes]
-    """How each episode ended, by planner."""
+    """Outcome of each episode, by planner."""
     config: dict[str, Any]
-    """What was run."""
+    """The configuration that was run."""
 
     def table(self) -> str:
         """The rows as text."""
@@ -40,11 +40,11 @@ class Evaluation:
         """Write ``results.json``, ``episodes.json`` and the plot ``results.png``.
 
         Args:
-            folder: may hold the same evaluation already.
+            folder: may already hold the same evaluation.
             overwrite: replace other results in it.
 
         Raises:
-            InputError: the folder holds a sweep, or results of something else.
+            InputError: the folder holds a sweep or other results.
             OutputError: the folder cannot be written to.
         """
         folder = Path(folder)
@@ -87,8 +87,7 @@ def evaluate(
         split: ``test``, or ``dev`` for tuning.
         num_envs: episodes simulated at once; does not change the results of the task's planners.
         num_threads: of the simulation, 0 for all cores; does not change the results.
-        delivery: when plans become available, e.g. `torchdyn_plan.planners.Delayed`; planners that make no plans have
-            none.
+        delivery: when plans become available, e.g. `torchdyn_plan.planners.Delayed`; ignored by planners without plans.
         sensor: sensor model of the target; exact for None.
         track: filter between sensor and planners, e.g. `torchdyn_plan.planners.KalmanTrack`; for None planners see the
             newest measurement, held from step to step.
@@ -97,11 +96,11 @@ def evaluate(
         out: folder for the results; it is checked before anything runs.
         overwrite: replace other results in that folder.
         progress: show progress bars.
-        settings: of the task, by name; the others are at their defaults.
+        settings: the task's settings by name; the others keep their defaults.
 
     Raises:
         InputError: an unknown name, a number out of range, a planner that belongs to another scene, or a folder that
-            holds a sweep, or results of something else.
+            holds a sweep or other results.
         WeightsError: weights are missing or damaged.
         OutputError: the folder cannot be written to.
     """
@@ -134,7 +133,7 @@ def evaluate(
         try:
             found.save(out, overwrite=overwrite)
         except OutputError as error:
-            # If it cannot be saved, it is at least printed.
+            # If saving fails, the table is at least printed.
             error.add_note(found.table())
             raise
     return found

@@ -1,4 +1,4 @@
-"""What a result is of, and that a folder never holds results of two kinds."""
+"""Identity of a result, and the check that a folder never mixes results."""
 
 from __future__ import annotations
 
@@ -15,24 +15,24 @@ from torchdyn_plan.schemas import check_content
 from torchdyn_plan.versions import library_versions
 
 FREE = ("num_envs", "num_threads", "values", "repeats")
-"""Of what was run, what does not change results, or only adds points to a sweep."""
+"""Settings that do not change results, or only add points to a sweep."""
 SWEEP, POINTS = "sweep.json", "points"
-"""What a folder has that holds a sweep: its identity, and the folder of its points."""
+"""Contents of a sweep's folder: its identity, and the folder of its points."""
 RESULTS, EPISODES = "results.json", "episodes.json"
-"""Files of an evaluation; a sweep has the first of them, too."""
+"""Files of an evaluation; a sweep also has the first of them."""
 
 
 class Results(TypedDict):
-    """What is read back of ``results.json``."""
+    """Content of ``results.json`` that is read back."""
 
     config: dict[str, Any]
     versions: dict[str, str | None]
 
 
 def identity_of(config: Mapping[str, Any], version: str | None = None) -> dict[str, Any]:
-    """What decides a result, by name: task, planners, weights, scene, episodes, each setting, and this package.
+    """Everything that determines a result: task, planners, weights, scene, episodes, settings and package version.
 
-    ``config`` is what was run, as `torchdyn_plan.evaluation.study.Study` tells it; ``version`` is of the package, the
+    ``config`` is the configuration from `torchdyn_plan.evaluation.study.Study`; ``version`` is the package's, the
     installed one for None.
     """
     decides = {name: value for name, value in config.items() if name not in FREE}
@@ -46,7 +46,7 @@ def identity_of(config: Mapping[str, Any], version: str | None = None) -> dict[s
 
 
 def digest_of(identity: Mapping[str, Any]) -> str:
-    """A few letters that tell identities apart."""
+    """A short digest of an identity."""
     return hashlib.sha256(json.dumps(identity, sort_keys=True).encode()).hexdigest()[:16]
 
 

@@ -24,12 +24,12 @@ from torchdyn_plan.versions import library_versions, machine
 NO_CAUSE = -1
 """Code of an episode that did not fail, or whose task names no causes."""
 TRACK, TRACK_COUNTS = "track_", ("used", "restarts", "rejected")
-"""What a track counts below ``plan``, and in files behind the first of these words."""
+"""Counts of a track under ``plan`` and in files, with the first of these as their prefix."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class EpisodeOutcomes:
-    """How each of E episodes ended, in the order of their numbers; every tensor has shape ``(E,)``."""
+    """Outcomes of E episodes, in the order of their numbers; every tensor has shape ``(E,)``."""
 
     success: Tensor
     """Bool."""
@@ -38,7 +38,7 @@ class EpisodeOutcomes:
     replans: Tensor
     """Number of plans, int64."""
     solvable: Tensor
-    """The episode can be solved at all, by the task's notion of it, bool."""
+    """Whether the episode can be solved at all, by the task's definition, bool."""
     flags: Mapping[str, Tensor] = field(default_factory=dict)
     """Further outcomes of the task, bool, by name."""
     evidence: Mapping[str, Tensor] = field(default_factory=dict)
@@ -68,16 +68,16 @@ class EpisodeOutcomes:
 
     @property
     def track(self) -> dict[str, Tensor]:
-        """Measurements that the planner's track counted, by what became of them; empty for a planner without a track.
+        """Numbers of measurements counted by the planner's track; empty for a planner without a track.
 
-        ``used`` ones are those since the target was last out of sight for long, ``restarts`` did not fit the motion
-        before and began another, ``rejected`` ones were of no use.
+        ``used`` since the track last lost its target, ``restarts`` of the motion by measurements that did not fit, and
+        ``rejected`` measurements.
         """
         named = {name: self.evidence.get(f"{TRACK}{name}") for name in TRACK_COUNTS}
         return {name: count for name, count in named.items() if count is not None}
 
     def to_json(self, task: Task) -> dict[str, Any]:
-        """Lists and numbers for a JSON file, in the words of ``task``, the name of each failure's cause among them."""
+        """Lists and numbers for a JSON file, with the task's names, including the cause of each failure."""
         counts = {"solvable": self.solvable, "steps": self.steps, "replans": self.replans}
         tensors = {task.words.success: self.success, **self.flags, **counts, **self.evidence}
         content: dict[str, Any] = {name: tensor.tolist() for name, tensor in tensors.items()}
@@ -89,7 +89,7 @@ class EpisodeOutcomes:
     def from_json(cls, content: Mapping[str, Any], task: Task) -> EpisodeOutcomes:
         """The outcomes that `to_json` wrote.
 
-        A file does not tell evidence that is bool from flags: both are read as flags.
+        A file does not distinguish boolean evidence from flags: both are read as flags.
 
         Raises:
             InputError: an entry is missing, is of another kind, or names a cause that ``task`` does not know.
@@ -105,7 +105,7 @@ class EpisodeOutcomes:
         tensors = {name: torch.tensor(content[name]) for name in content if name not in {"cause", "seconds"}}
         others = {name: tensor for name, tensor in tensors.items() if name not in own}
         for name, tensor in others.items():
-            # What is finite in a file may be too large for float32.
+            # A finite number in a file may be too large for float32.
             check_finite(f"episode outcomes: {name}", tensor)
         return cls(
             success=tensors[task.words.success],
@@ -121,13 +121,13 @@ class EpisodeOutcomes:
 
     @classmethod
     def merge(cls, parts: Sequence[EpisodeOutcomes]) -> EpisodeOutcomes:
-        """One after the other, as if they had been one run; their times add up."""
+        """Concatenate outcomes as if they were one run; their times add up."""
         names = ("success", "steps", "replans", "solvable", "cause")
         first = parts[0]
         for part in parts:
             if part.flags.keys() != first.flags.keys() or part.evidence.keys() != first.evidence.keys():
                 one, other = ([*part.flags, *part.evidence], [*first.flags, *first.evidence])
-                raise InputError(f"outcomes of one run tell of {', '.join(one)}, of another of {', '.join(other)}")
+                raise InputError(f"outcomes of one run have {', '.join(one)}, those of another {', '.join(other)}")
         return cls(
             **{name: torch.cat([getattr(part, name) for part in parts]) for name in names},
             flags={name: torch.cat([part.flags[name] for part in parts]) for name in first.flags},
@@ -145,7 +145,7 @@ _ENTRIES = {
 }
 _CAUSES = list[str | None]
 _OTHERS = list[bool] | list[float]
-"""Entries of episode outcomes in a file, beside the task's success: those of every task, and flags and evidence."""
+"""Further entries of episode outcomes in a file: those of every task, flags and evidence."""
 
 
 def _codes(names: Sequence[str | None], causes: Sequence[str]) -> Tensor:
@@ -188,18 +188,17 @@ class ResultRow:
     paper_success_solvable: float | None
     """The paper's success rate over solvable episodes at this setting; None where it has none."""
     repeats: int = 1
-    """Series of episodes that the row is over."""
+    """Number of series of episodes in the row."""
     success_repeats: tuple[float, float] | None = None
     """Mean and standard deviation of ``success`` over the repeats of a sweep, as the paper reports; None for one."""
     success_solvable_repeats: tuple[float, float] | None = None
-    """The same of ``success_solvable``; None also where a repeat has no solvable episode."""
+    """The same for ``success_solvable``; also None if a repeat has no solvable episode."""
     track: dict[str, float] = field(default_factory=dict)
-    """Mean number of measurements an episode by what the planner's track made of them, as `EpisodeOutcomes.track` has
-    them; empty for a planner without a track."""
+    """Means per episode of the track's counts, see `EpisodeOutcomes.track`; empty for a planner without a track."""
 
 
 def failure_shares(outcomes: EpisodeOutcomes) -> dict[str, float]:
-    """Share of all episodes that failed of each cause, by name."""
+    """Share of all episodes that failed from each cause, by name."""
     codes = outcomes.cause[outcomes.cause != NO_CAUSE]
     counts = torch.bincount(codes, minlength=len(outcomes.causes))
     return {name: count / outcomes.episodes for name, count in zip(outcomes.causes, counts.tolist(), strict=True)}
@@ -243,7 +242,7 @@ def _paper_rates(task: Task, planner: str, static: str, settings: Settings) -> t
 
 
 def over_repeats(row: ResultRow, repeats: Sequence[EpisodeOutcomes]) -> ResultRow:
-    """``row``, that is over all of the ``repeats``, with mean and standard deviation over them."""
+    """``row`` over all ``repeats``, with mean and standard deviation over them."""
 
     def spread(rates: Sequence[float]) -> tuple[float, float] | None:
         if len(rates) < 2 or not all(math.isfinite(one) for one in rates):

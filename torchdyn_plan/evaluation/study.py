@@ -1,4 +1,4 @@
-"""Planners and the episodes that they all run: what an evaluation and a sweep have in common."""
+"""Planners and the episodes they all run: the common part of an evaluation and a sweep."""
 
 from __future__ import annotations
 
@@ -65,7 +65,7 @@ class Study:
         other_scene: bool = False,
         **episodes: Any,
     ) -> Study:
-        """The study of ``planners``, as `evaluate` says; ``episodes`` are the other fields."""
+        """The study of ``planners``, see `evaluate`; ``episodes`` are the other fields."""
         static = static or task.default_static
         check_choice(f"static planner of {task.name}", static, task.static_planners)
         # Fields are checked before weights are loaded.
@@ -75,7 +75,7 @@ class Study:
         elif weights is None:
             made = dict(planners)
         else:
-            raise InputError("weights are of planners that are named, but the planners were given themselves")
+            raise InputError("weights apply to planners given by name, but planner objects were given")
         if not made:
             raise InputError(f"planners must name at least one of {', '.join(task.planners)}")
         if study.track is not None:
@@ -108,11 +108,11 @@ class Study:
         return [summarize(outcome, planner=name, **shared) for name, outcome in outcomes.items()]
 
     def config(self) -> dict[str, Any]:
-        """What was run, for a file of results."""
+        """The configuration, for a file of results."""
         counts = {name: getattr(self, name) for name in ("episodes", "split", "num_envs", "num_threads")}
         delivery = None if self.delivery is None else repr(self.delivery)
         about = {"task": self.task.name, "planners": list(self.planners), "static": self.static}
-        # Folders of results from before there were sensors say nothing of them.
+        # Left out if absent, so that results from before sensors existed keep their configuration.
         sensor = {} if self.sensor is None or self.sensor.is_exact else {"sensor": self.sensor.told()}
         track = {} if self.track is None else {"track": self.track.told()}
         whole = {"delivery": delivery, "scene": self.task.digest(), "weights": dict(self.weights)}
@@ -120,7 +120,7 @@ class Study:
 
     @cached_property
     def weights(self) -> Mapping[str, str | None]:
-        """What each planner is made of, its networks' tensors among it, in a few letters; None for a function."""
+        """A short digest of each planner, including its networks' weights; None for a function."""
         return {name: planner_digest(planner) for name, planner in self.planners.items()}
 
 
@@ -138,28 +138,28 @@ def _make(task: Task, names: Sequence[str] | None, static: str, weights: str | P
 
 
 def _check_scenes(task: Task, planners: Mapping[str, Planner]) -> None:
-    """Raise `InputError` if a planner says that it belongs to another scene; a plain function says nothing."""
+    """Raise `InputError` if a planner belongs to another scene; plain functions belong to none."""
     here = task.digest()
     for name, planner in planners.items():
         scene = getattr(planner, "scene", None)
         if scene not in (None, here):
             raise InputError(
                 f"planner {name!r} belongs to another scene ({scene}) than {task.name} ({here}): "
-                "give other_scene=True to evaluate it all the same"
+                "give other_scene=True to evaluate it anyway"
             )
 
 
 def _tracked(name: str, planner: Planner, track: Track, task: Task) -> TrackedPlanner:
     """``planner`` behind ``track``; raises `InputError` for one that has a track, or cannot have one."""
     if isinstance(planner, TrackedPlanner):
-        raise InputError(f"planner {name!r} has a track of its own: give it without, or no track beside it")
+        raise InputError(f"planner {name!r} already has a track: give the planner without it, or give no other track")
     if not isinstance(planner, TensorDictModuleBase):
-        raise InputError(f"planner {name!r} is no planner of this package, and can have no track")
+        raise InputError(f"planner {name!r} is not a planner of this package, and cannot have a track")
     return TrackedPlanner(planner, track, control_step=task.control_step)
 
 
 def _delivered(planner: Planner, delivery: Delivery) -> Planner:
-    """The same planner with ``delivery``; a planner that makes no plans is returned unchanged."""
+    """The planner with ``delivery``; a planner without plans is returned unchanged."""
     if isinstance(planner, TrackedPlanner):
         return planner.with_planner(_delivered(planner.planner, delivery))
     return planner.with_parts(delivery=delivery) if isinstance(planner, DynamicPlanner) else planner

@@ -36,7 +36,7 @@ class Point(TypedDict):
     identity: str
     """Digest of the sweep and the point."""
     content: str
-    """Digest of the planners' outcomes: a file that was damaged does not have it."""
+    """Digest of the planners' outcomes, to detect damage."""
     planners: dict[str, dict[str, Any]]
     """Outcomes of each planner's episodes."""
 
@@ -75,9 +75,9 @@ def sweep(
         planners: as of `evaluate`.
         over: the setting that varies.
         out: folder of the sweep.
-        values: of that setting; those of the paper's curve for None, and the task's own where there is none.
-        repeats: series of episodes for each value, with seeds upwards from ``seed``.
-        static: as of `evaluate`, like all further arguments.
+        values: values of that setting; None for those of the paper's curve, or the task's own if there is none.
+        repeats: series of episodes for each value, with seeds counting up from ``seed``.
+        static: see `evaluate`, as for all further arguments.
         episodes: number of episodes for each planner, value and repeat.
         seed: the first series of episodes.
         split: ``test`` or ``dev``.
@@ -90,10 +90,10 @@ def sweep(
         other_scene: allow planners that belong to another scene.
         overwrite: remove all results in the folder, including points of this sweep.
         progress: show progress bars.
-        engine: ``here``, or ``ray`` to have workers of a Ray cluster run the points: the same results, but for the
-            time that they took.
-        workers: number of Ray workers, of one thread each; one for each processor for None.
-        settings: of the task, by name, but for the one that varies.
+        engine: ``here`` or ``ray``, which runs the points in workers of a Ray cluster. Results are the same except for the
+            times that they took.
+        workers: number of Ray workers, with one thread each; one per processor for None.
+        settings: the task's other settings, by name.
 
     Returns:
         A row for each value and planner, over the episodes of all repeats.
@@ -138,7 +138,7 @@ def sweepable(task: Task) -> list[str]:
 
 
 def default_values(task: Task, over: str, static: str, settings: Settings) -> list[float]:
-    """Where the paper's figure has points, if it varied ``over`` at these settings; else the task's own values."""
+    """Values in the paper's figure, if it varies ``over`` at these settings; else the task's own values."""
     if task.paper is not None:
         paper = task.paper()
         curves = (paper.curve(planner, static, over, settings, solvable=False) for planner in task.planners)
@@ -163,7 +163,7 @@ class _Sweep:
     engine: Engine
 
     def run(self, overwrite: bool) -> list[ResultRow]:
-        """Run the points that the folder lacks, and put together all that were asked for."""
+        """Run the points that the folder lacks, and combine all requested points."""
         if overwrite:
             clear_results(self.out)
         if not check_sweep_folder(self.out, self._identity()):
@@ -181,11 +181,11 @@ class _Sweep:
         return self.study.config() | {"settings": settings} | own
 
     def _identity(self) -> dict[str, Any]:
-        """What decides the outcome of every point."""
+        """Everything that determines the outcome of the points."""
         return identity_of(self._config())
 
     def _digest(self, value: float, repeat: int) -> str:
-        """Which point it is, of which sweep."""
+        """Digest of the sweep and the point."""
         return digest_of(self._identity() | {self.over: value, "seed": self.seed + repeat})
 
     def _run_missing_points(self) -> None:
@@ -213,14 +213,14 @@ class _Sweep:
         return [over_repeats(row, [point[row.planner] for point in repeats]) for row in rows]
 
     def _read_point(self, value: float, repeat: int) -> dict[str, EpisodeOutcomes]:
-        """Outcomes by planner; raises `InputError` where the file is damaged, or of another point."""
+        """Outcomes by planner; raises `InputError` if the file is damaged or of another point."""
         path = self._path(value, repeat)
         try:
             point: Point = check_content(read_json(path), Point, short_path(path))
             if point["identity"] != self._digest(value, repeat):
                 raise InputError("it is of another sweep, or of another point")
             if point["content"] != digest_of(point["planners"]):
-                raise InputError("it holds something else than was written")
+                raise InputError("it differs from what was written")
             return {name: self._outcomes(point, name) for name in self.study.planners}
         except InputError as error:
             raise InputError(f"point {short_path(path)} is damaged ({error}): delete it to run it again") from error

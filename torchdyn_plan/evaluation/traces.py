@@ -1,4 +1,4 @@
-"""The record of episodes, step by step, kept while they run side by side."""
+"""Step-by-step records of episodes that run in parallel."""
 
 from __future__ import annotations
 
@@ -12,32 +12,32 @@ from torchdyn_plan import keys
 
 
 class Trace(NamedTuple):
-    """Records of R episodes at control steps 0 … T-1; what lies beyond an episode's end is arbitrary."""
+    """Records of R episodes at control steps 0 … T-1; values after an episode's end are arbitrary."""
 
     tool_pos: Tensor
     """``(R, T, D)`` [m, world]"""
     target_pos: Tensor
     """``(R, T, D)`` [m, world]"""
     goal: Tensor
-    """``(R, T, D)`` of the plan in force; of the static planner, if there are no plans [m, world]."""
+    """``(R, T, D)`` goal of the plan in use, or of the static planner if there are no plans [m, world]."""
     arrival_steps: Tensor
     """``(R, T)`` int64 control steps to the meeting."""
     planned: Tensor
     """``(R, T)`` bool: a plan was made at this step."""
     reachable: Tensor
-    """``(R, T)`` bool: the robot can be in time for the meeting, by the plan in force."""
+    """``(R, T)`` bool: the robot can be in time for the meeting, according to the plan in use."""
     length: Tensor
     """``(R,)`` int64: the step at which the episode ended."""
     joint_speed: Tensor
-    """``(R, T)`` of the fastest joint [rad/s]; 0 of a robot that shows no joints."""
+    """``(R, T)`` speed of the fastest joint [rad/s]; 0 for a robot without joints."""
 
 
 PLACES, NUMBERS = 3, 4
-"""Places and single numbers of a record at each step: those of `Trace` but the length."""
+"""Positions and single numbers recorded at each step: the fields of `Trace` except the length."""
 
 
 class TraceLog:
-    """Records what environments and planner write; each environment's row starts afresh with its next episode."""
+    """Records what environments and planner write; each environment's row restarts with its next episode."""
 
     def __init__(self, max_steps: int) -> None:
         """Room for episodes of up to ``max_steps`` control steps."""
@@ -47,7 +47,7 @@ class TraceLog:
         self._lengths: list[Tensor] = []
 
     def add(self, stepped: TensorDictBase) -> None:
-        """Take in one step of all environments, before it was acted."""
+        """Add one step of all environments, before the action takes effect."""
         tool_pos: Tensor = stepped.get(keys.TOOL_POS)
         step: Tensor = stepped.get(keys.STEP_COUNT).squeeze(-1)
         if len(self._record) != len(step):
@@ -60,12 +60,12 @@ class TraceLog:
         else:
             goal, *numbers = map(plan.get, ("goal", "arrival_steps", "replanned", "reachable"))
             numbers = torch.stack(numbers, dim=-1)
-        # A goal that says how the tool is turned is remembered as the place that it is.
+        # Of a goal with an orientation only the position is kept.
         entries = torch.cat([*_shown(stepped), goal[..., : tool_pos.shape[-1]], numbers], dim=-1)
         self._record[self._rows, step] = entries.to(self._record.dtype)
 
     def end(self, stepped: TensorDictBase, rows: Tensor) -> None:
-        """Put the episodes of environments ``rows`` (R,) away, which end with this step."""
+        """Store the episodes of environments ``rows`` (R,), which end with this step."""
         after: TensorDictBase = stepped.get("next")
         length = after[keys.STEP_COUNT].squeeze(-1)[rows]
         record = self._record[rows]
@@ -75,7 +75,7 @@ class TraceLog:
         self._lengths.append(length)
 
     def traces(self, block: int = 256) -> list[Trace]:
-        """The episodes put away, in the order in which they ended, ``block`` at a time."""
+        """The stored episodes, in the order in which they ended, ``block`` at a time."""
         if not self._ended:
             return []
         records, lengths = torch.cat(self._ended), torch.cat(self._lengths)
@@ -85,7 +85,7 @@ class TraceLog:
 
 
 def _shown(observed: TensorDictBase) -> list[Tensor]:
-    """What an environment shows: where robots and targets are, (N, D) each, and the fastest joint's speed (N, 1)."""
+    """Positions of robots and targets, (N, D) each, and the speed of the fastest joint (N, 1)."""
     tool_pos: Tensor = observed.get(keys.TOOL_POS)
     joint_vel = observed.get(keys.JOINT_VEL, None)
     speed = torch.zeros_like(tool_pos[:, :1]) if joint_vel is None else joint_vel.abs().amax(-1, keepdim=True)
@@ -93,7 +93,7 @@ def _shown(observed: TensorDictBase) -> list[Tensor]:
 
 
 def true_target(tensordict: TensorDictBase) -> Tensor:
-    """Where targets are, ``(*B, D)`` [m, world], unaffected by the sensor."""
+    """True positions of the targets, ``(*B, D)`` [m, world], unaffected by the sensor."""
     truth = tensordict.get(keys.TRUE_TARGET_POS, None)
     return tensordict[keys.TARGET_POS] if truth is None else truth
 

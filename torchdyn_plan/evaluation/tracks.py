@@ -1,4 +1,4 @@
-"""Tracks by name, as the command line selects them."""
+"""Tracks by name, for the command line."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ NO_TRACK = "none"
 TRACKS: Mapping[str, type[Track]] = {"least_squares": LeastSquaresTrack, "kalman": KalmanTrack}
 """Filters that may stand between sensor and planner."""
 LEAST_NOISE = 1e-4
-"""A track takes no measurement for better than this [m]: targets do not move as smoothly as its filter says."""
+"""Lower bound on a track's ``noise`` [m], because targets do not move as smoothly as the filter's model."""
 
 
 def track_named(name: str, sensor: Sensor | None = None, **settings: Any) -> Track | None:
@@ -24,9 +24,8 @@ def track_named(name: str, sensor: Sensor | None = None, **settings: Any) -> Tra
 
     Args:
         name: ``none``, or one of `TRACKS`.
-        sensor: whose measurements it sees, an exact one for None; their error is the track's ``noise`` where no other
-            is given.
-        settings: of the track, by the names of its fields; the others are at their defaults.
+        sensor: sensor in front of it, an exact one for None; its error is the track's ``noise`` unless given.
+        settings: settings of the track by name; the others keep their defaults.
 
     Raises:
         InputError: there is no such track, it has no such setting, or a number is out of range.

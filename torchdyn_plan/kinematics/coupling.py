@@ -1,4 +1,4 @@
-"""Arms in which one joint moves another: their own positions, and those of all joints of the chain."""
+"""Arms with coupled joints: maps the N independent positions to those of the chain's M joints."""
 
 from __future__ import annotations
 
@@ -18,11 +18,11 @@ from torchdyn_plan.precision import Precise, autocast_is_on, without_autocast
 
 
 def drivers_of(joints: Sequence[Joint]) -> tuple[list[Joint], Tensor, Tensor]:
-    """The joints whose N positions say where the chain's M joints are: q · ratios + shifts.
+    """The N independent joints that determine the positions of the chain's M joints, q · ratios + shifts.
 
     Returns:
-        They, in the order in which they first move the chain, with limits that hold for all that they move; ratios
-        ``(N, M)`` and shifts ``(M,)``, float64.
+        The independent joints, in the order in which they first move the chain, with limits that hold for all joints
+        they drive; ratios ``(N, M)`` and shifts ``(M,)``, float64.
 
     Raises:
         InputError: limits leave a joint no position.
@@ -43,7 +43,7 @@ def drivers_of(joints: Sequence[Joint]) -> tuple[list[Joint], Tensor, Tensor]:
 
 
 def _limited(driver: Joint, moved: Sequence[Joint]) -> Joint:
-    """``driver`` with limits within which all that it moves is within its own."""
+    """``driver`` with limits that keep all joints it drives within their own."""
     for joint in moved:
         if joint.coupling is None:
             continue
@@ -61,7 +61,7 @@ def _limited(driver: Joint, moved: Sequence[Joint]) -> Joint:
 
 
 class CoupledForm(Precise):
-    """A form of the chain's M joints, by the N positions that move them."""
+    """A form of the chain's M joints as a function of the N independent positions."""
 
     form: SineForm | TransformForm
     _ratios: Tensor
@@ -89,7 +89,7 @@ class CoupledForm(Precise):
 
 
 class CoupledComponents:
-    """A `ComponentForm` of the chain's M joints, by the N positions that move them."""
+    """A `ComponentForm` of the chain's M joints as a function of the N independent positions."""
 
     def __init__(self, form: ComponentForm, ratios: Tensor, shifts: Tensor) -> None:
         """Take a form, and the ratios ``(N, M)`` and shifts ``(M,)`` of `drivers_of`."""
@@ -99,7 +99,7 @@ class CoupledComponents:
         self.shifts: list[float] = shifts.tolist()
 
     def __call__(self, joint_pos: Sequence[Tensor]) -> tuple[Matrix, Vector, Matrix]:
-        """As of `ComponentForm`, with N columns."""
+        """Like `ComponentForm`, with N columns."""
         lines = list(zip(self.drivers, self.ratios, self.shifts, strict=True))
         positions = [add(multiply(ratio, joint_pos[driver]), shift) for driver, ratio, shift in lines]
         rotation, place, moved = self.form(cast(list[Tensor], positions))
@@ -111,7 +111,7 @@ class CoupledComponents:
 
 
 def full_turns(joints: Sequence[Joint], ratios: Tensor) -> tuple[bool, ...]:
-    """Whether a full turn of each position leaves the chain's pose as it is: all that it moves turns in whole turns."""
+    """Whether a full turn of each position leaves the chain's pose unchanged: all that it drives makes whole turns."""
     return tuple(
         all(
             joint.kind == "revolute" and math.isfinite(ratio) and ratio == round(ratio)

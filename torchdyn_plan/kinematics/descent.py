@@ -1,4 +1,4 @@
-"""Descents by damped least squares within the joints' limits, many side by side: the loop inside `solve_ik`."""
+"""Batched damped least squares within joint limits: the inner loop of `solve_ik`."""
 
 from __future__ import annotations
 
@@ -12,17 +12,17 @@ from torchdyn_plan.kinematics.dls import dls_step_within
 from torchdyn_plan.kinematics.targets import constraint_error, constraint_jacobian
 
 BLOCK = 64
-"""Rows of one product of matrices: a fixed number, so that a row's answer does not depend on its company."""
+"""Rows per matrix product: a fixed number, so that a row's result does not depend on the batch."""
 STUCK = 0.05
-"""A try ends with a step that should take away less than this share of the error: limits or axes in line bar the way.
+"""A try ends when a step is predicted to remove less than this share of the error: limits or a singularity block it.
 
-Of a step that is shortened to ``max_step``, as much less is expected. The share has no unit, so arms of any size and in
-any unit are searched alike.
+For a step that is shortened to ``max_step``, the threshold is reduced in proportion. The share has no unit, so it holds
+for arms of any size.
 """
 
 
 class Search(NamedTuple):
-    """What is asked of the descents; ``M`` is the number of targets."""
+    """Targets and settings of a search; ``M`` is the number of targets."""
 
     arm: Arm
     target: Tensor
@@ -34,33 +34,33 @@ class Search(NamedTuple):
     constraint: str
     symmetry: int
     tolerances: tuple[float, float]
-    """Of place [m] and of direction [rad]."""
+    """Of position [m] and orientation [rad]."""
     iterations: int
     max_step: Tensor
     """``(N,)`` [rad; m]"""
     posture: Tensor | None = None
     """``(M, N)``"""
     weights: Tensor | None = None
-    """``(M, R, R)``, by which the error and the Jacobian's rows are multiplied."""
+    """``(M, R, R)``, multiply the error and the Jacobian's rows."""
     ease: Tensor | None = None
-    """``(N,)``; of the motions that would do, a joint takes a share that grows with the square of this."""
+    """``(N,)``; weights of the joints: a redundant arm moves a joint in proportion to the square of its weight."""
 
     def bounds(self, rows: Tensor) -> tuple[Tensor, Tensor]:
-        """Limits of some rows, ``(A, N)``, or ``(N,)`` where all have the same."""
+        """Limits of some rows, ``(A, N)``, or ``(N,)`` if all have the same."""
         if self.lower.ndim == 1:
             return self.lower, self.upper
         return self.lower[rows], self.upper[rows]
 
     def cost(self, residual: Tensor) -> Tensor:
-        """Residuals ``(*B, 2)`` in units of their tolerances, the worse of both: at most 1 where solved."""
+        """The larger of the residuals ``(*B, 2)`` in units of their tolerances: at most 1 if solved."""
         place, direction = self.tolerances
         return torch.maximum(residual[..., 0] / place, residual[..., 1] / direction)
 
 
 def descend(search: Search, tries: Tensor, rows: Tensor, *, all_tries: bool = False) -> tuple[Tensor, Tensor]:
-    """From ``tries`` (A, S, N) towards the targets of ``rows`` (A,): the best positions on the way of each.
+    """Search from ``tries`` (A, S, N) for the targets of ``rows`` (A,): the best positions found by each try.
 
-    A try ends within the tolerances, and with it its row's other tries, unless ``all_tries`` go on to their own ends.
+    A try ends within the tolerances, and its row's other tries end with it, unless ``all_tries`` is true.
 
     Returns:
         Positions ``(A, S, N)`` and residuals ``(A, S, 2)``.
@@ -94,15 +94,15 @@ def descend(search: Search, tries: Tensor, rows: Tensor, *, all_tries: bool = Fa
 
 
 def error_at(search: Search, pose: Tensor, rows: Tensor) -> Tensor:
-    """What is left to go from ``pose`` (A, 4, 4) to the targets of ``rows`` (A,): ``(A, R)`` [m; rad]."""
+    """Error from ``pose`` (A, 4, 4) to the targets of ``rows`` (A,): ``(A, R)`` [m; rad]."""
     target = search.target[rows]
     error = constraint_error(pose, target, constraint=search.constraint, symmetry=search.symmetry)
     return error if search.weights is None else (search.weights[rows] @ error.unsqueeze(-1)).squeeze(-1)
 
 
 def rows_at(search: Search, jacobian: Tensor, rows: Tensor) -> Tensor:
-    """The Jacobian's rows ``(A, R, N)`` that move along `error_at`, from the whole ones ``(A, 6, N)``."""
-    # Only the rows of an axis depend on the target.
+    """The Jacobian's rows ``(A, R, N)`` for `error_at`, from the full Jacobians ``(A, 6, N)``."""
+    # Only the rows of the constraint "axis" depend on the target.
     target = search.target[rows] if search.constraint == "axis" else search.target
     found = constraint_jacobian(jacobian, target, constraint=search.constraint)
     return found if search.weights is None else search.weights[rows] @ found
@@ -114,12 +114,12 @@ def residual_at(search: Search, q: Tensor, rows: Tensor) -> Tensor:
 
 
 def lengths(error: Tensor) -> Tensor:
-    """Of place and of direction, ``(A, R)`` -> ``(A, 2)``."""
+    """Norms of the position and orientation errors, ``(A, R)`` -> ``(A, 2)``."""
     return torch.stack([error[:, :3].norm(dim=-1), error[:, 3:].norm(dim=-1)], dim=-1)
 
 
 def evaluate(arm: Arm, q: Tensor) -> tuple[Tensor, Tensor]:
-    """Poses and Jacobians for ``(M, N)``, by products of always `BLOCK` rows."""
+    """Poses and Jacobians for ``(M, N)``, in blocks of `BLOCK` rows."""
     padded = torch.nn.functional.pad(q, (0, 0, 0, -len(q) % BLOCK))
     parts = [arm.pose_and_jacobian(block) for block in padded.split(BLOCK)]
     pose, jacobian = (torch.cat(part)[: len(q)] for part in zip(*parts, strict=True))
@@ -127,10 +127,10 @@ def evaluate(arm: Arm, q: Tensor) -> tuple[Tensor, Tensor]:
 
 
 def stepped(search: Search, q: Tensor, jacobian: Tensor, error: Tensor, index: Tensor) -> tuple[Tensor, Tensor]:
-    """One step of Levenberg and Marquardt (Sugihara 2011: λ² grows with the error), within limits of step and joint.
+    """One Levenberg-Marquardt step (Sugihara 2011: λ² grows with the error), within step and joint limits.
 
     Returns:
-        Where the joints are then, ``(A, N)``, and whether it is worth going on from there, ``(A,)``; see `STUCK`.
+        The new joint positions, ``(A, N)``, and whether it is worth continuing from there, ``(A,)``; see `STUCK`.
     """
     lower, upper = search.bounds(index)
     square = (error * error).sum(dim=-1)
@@ -145,11 +145,11 @@ def stepped(search: Search, q: Tensor, jacobian: Tensor, error: Tensor, index: T
         step = step * search.ease
     worst = (step.abs() / search.max_step).amax(dim=-1, keepdim=True).clamp_min(1.0)
     after = torch.clamp(q + step / worst, lower, upper)
-    # What the step takes away of the error to first order, times the error.
+    # First-order reduction of the error by the step, times the error.
     taken = ((jacobian @ (after - q).unsqueeze(-1)).squeeze(-1) * error).sum(dim=-1)
     return after, taken * worst.squeeze(-1) > STUCK * square
 
 
 def _least_damping(dtype: torch.dtype) -> float:
-    """λ² at the target: what keeps the squares of singular values apart from rounding."""
+    """λ² at the target: keeps the squared singular values above rounding."""
     return 1e-8 if dtype == torch.float64 else 1e-5

@@ -1,4 +1,4 @@
-"""A serial chain as a list of joints, the one description from which every form of an arm is made."""
+"""A serial chain as a list of joints, from which every form of an arm is made."""
 
 from __future__ import annotations
 
@@ -33,15 +33,15 @@ class Joint:
     speed_limit: float = math.inf
     """[rad/s; m/s]"""
     coupling: Coupling | None = None
-    """How another joint moves this one; None for a joint that moves on its own."""
+    """How another joint drives this one; None for an independent joint."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class Coupling:
-    """That a joint is at ``ratio · q + shift``, with q the position of another joint, the driver."""
+    """A joint's position is ``ratio · q + shift``, with q the position of another joint, the driver."""
 
     driver: Joint
-    """The other joint, in the chain or not. Its name says which it is; its limits hold, its offset does not matter."""
+    """The other joint, in the chain or not. Identified by its name; its limits apply, its offset does not matter."""
     ratio: float = 1.0
     shift: float = 0.0
     """[rad; m]"""
@@ -51,7 +51,7 @@ def merge_fixed(joints: Sequence[Joint]) -> tuple[list[Joint], Tensor]:
     """The joints that move, fixed ones folded into the next one's offset, and the transform after the last of them.
 
     Raises:
-        InputError: a joint's offset, axis or limits are not those of a joint.
+        InputError: a joint's offset, axis or limits are invalid.
     """
     moving: list[Joint] = []
     offset = torch.eye(4, dtype=torch.float64)
@@ -66,7 +66,7 @@ def merge_fixed(joints: Sequence[Joint]) -> tuple[list[Joint], Tensor]:
 
 
 def check_joint(joint: Joint) -> None:
-    """Raise `InputError`, naming the joint, unless its numbers are those of a joint."""
+    """Raise `InputError`, naming the joint, unless its numbers are valid."""
     named = f"joint {joint.name!r}"
     if joint.offset.shape != (4, 4):
         raise InputError(f"the offset of {named} must have shape (4, 4), got {tuple(joint.offset.shape)}")
@@ -81,7 +81,7 @@ def check_joint(joint: Joint) -> None:
 
 
 def check_limits(joint: Joint) -> None:
-    """Raise `InputError`, naming the joint, unless its limits leave it some position and some speed."""
+    """Raise `InputError`, naming the joint, unless its limits allow some position and some speed."""
     if not joint.lower <= joint.upper:
         raise InputError(f"joint {joint.name!r} has a lower limit of {joint.lower} and an upper one of {joint.upper}")
     if not joint.speed_limit > 0.0:
@@ -89,7 +89,7 @@ def check_limits(joint: Joint) -> None:
 
 
 def motion(kind: Kind, axis: Tensor, position: float) -> Tensor:
-    """Transform ``(4, 4)`` float64 of a joint that moves, about or along the unit vector ``axis``, at ``position``."""
+    """Transform ``(4, 4)`` float64 of a joint at ``position``, about or along the unit vector ``axis``."""
     if kind == "prismatic":
         return transform(position=position * axis)
     return transform(rotation_about(axis, position))

@@ -1,6 +1,6 @@
 # mujoco hides its names from type checkers.
 # pyright: reportAttributeAccessIssue=false
-"""Joints of an arm out of MJCF: MuJoCo compiles the description, and its model is walked by index from tip to base."""
+"""Joints of an arm from MJCF: MuJoCo compiles the description, and the model is walked by index from tip to base."""
 
 from __future__ import annotations
 
@@ -24,9 +24,9 @@ if TYPE_CHECKING:
     MjcfSource: TypeAlias = Source | mujoco.MjSpec | mujoco.MjModel
 
 WORLD = 0
-"""Index of the body that is the world."""
+"""Index of the world body."""
 KINDS: dict[str, Kind] = {"hinge": "revolute", "slide": "prismatic"}
-"""What an arm's joints are called in MJCF."""
+"""MJCF's names of joint types."""
 
 
 def joints_of_mjcf(source: MjcfSource, *, base: str | None, tip: str) -> list[Joint]:
@@ -35,7 +35,7 @@ def joints_of_mjcf(source: MjcfSource, *, base: str | None, tip: str) -> list[Jo
 
 
 def _compiled(source: MjcfSource) -> mujoco.MjModel:
-    """The model of ``source``; files beside a description are found from its own folder."""
+    """The model of ``source``; other files are searched for in the description's folder."""
     mujoco = _mujoco()
     if isinstance(source, mujoco.MjModel):
         return source
@@ -51,7 +51,7 @@ def _compiled(source: MjcfSource) -> mujoco.MjModel:
     except Exception as error:
         reason = " ".join(str(error).split())
         if "opening file" in reason:
-            reason += " (files are looked for beside the description, where that is given as a path)"
+            reason += " (files are searched for in the description's folder, if it is given as a path)"
         raise InputError(f"the MJCF text cannot be read: {reason}") from error
 
 
@@ -64,14 +64,14 @@ def _mujoco() -> Any:
 
 
 class _Scene:
-    """A compiled model, in which bodies, joints and sites are told by their index."""
+    """A compiled model, in which bodies, joints and sites are identified by index."""
 
     def __init__(self, model: mujoco.MjModel) -> None:
         self.model, self.mujoco = model, _mujoco()
         self.bodies, self.sites = self._indices("body", model.nbody), self._indices("site", model.nsite)
 
     def name(self, kind: str, index: int) -> str:
-        """Name of the body, joint, site or tendon of that index; of an unnamed one like ``joint#3``, with the index."""
+        """Name of a body, joint, site or tendon; an unnamed one is called by its index, such as ``joint#3``."""
         type_ = getattr(self.mujoco.mjtObj, f"mjOBJ_{kind.upper()}")
         name = self.mujoco.mj_id2name(self.model, type_, index) or f"{kind}#{index}"
         if self.mujoco.mj_name2id(self.model, type_, name) in (-1, index):
@@ -82,7 +82,7 @@ class _Scene:
         return {self.name(kind, index): index for index in range(count)}
 
     def place(self, tip: str) -> tuple[int | None, int]:
-        """The site of that name, or None, and its body: a site comes before a body of the same name."""
+        """The site of that name, or None, and its body; a site takes precedence over a body of the same name."""
         if tip in self.sites or (tip.startswith("site:") and tip not in self.bodies):
             site = self._index("site", tip)
             return site, int(self.model.site_bodyid[site])
@@ -91,7 +91,7 @@ class _Scene:
         return None, self._index("body", tip)
 
     def _index(self, kind: str, name: str) -> int:
-        """Index of the body or site ``name``, which may have its kind before it, as in ``site:tool``."""
+        """Index of the body or site ``name``, which may be prefixed by its kind, such as ``site:tool``."""
         known = self.bodies if kind == "body" else self.sites
         plain = name if name in known else name.removeprefix(f"{kind}:")
         check_choice(kind, plain, known)
@@ -113,7 +113,7 @@ class _Scene:
         return [joint for part in reversed(parts) for joint in part]
 
     def _of_body(self, body: int) -> Iterator[Joint]:
-        """A body's place in its parent, and its own joints in order."""
+        """A body's pose in its parent, and its joints in order."""
         model, first = self.model, int(self.model.body_jntadr[body])
         yield Joint(offset=_pose(model.body_pos[body], model.body_quat[body]), name=self.name("body", body))
         for index in range(first, first + int(model.body_jntnum[body])):
@@ -127,7 +127,7 @@ class _Scene:
         return float(self.model.qpos0[self.model.jnt_qposadr[joint]])
 
     def alone(self, joint: int) -> Joint:
-        """A joint by itself, without its place and without what couples it to others."""
+        """A joint without its pose and its couplings."""
         model, name = self.model, self.name("joint", joint)
         kind = self.mujoco.mjtJoint(int(model.jnt_type[joint])).name.removeprefix("mjJNT_").lower()
         if kind not in KINDS:
@@ -141,7 +141,7 @@ class _Scene:
         return make_joint(name, KINDS[kind], transform(), axis, limits=limits, speed=None)
 
     def _coupled(self, joint: Joint, index: int) -> Joint:
-        """``joint`` with what moves it, according to the equalities of the model."""
+        """``joint`` with its driver, according to the equalities of the model."""
         ratio, shift, seen = 1.0, 0.0, [index]
         while seen[-1] in self.couplings:
             equality = self.couplings[seen[-1]]
@@ -161,7 +161,7 @@ class _Scene:
 
     @cached_property
     def couplings(self) -> dict[int, Equality | str]:
-        """What moves each joint that is coupled to another, or why that cannot be had."""
+        """The coupling of each coupled joint, or why it is not supported."""
         model, found = self.model, {}
         for index in range(model.neq):
             if not model.eq_active0[index]:
@@ -180,7 +180,7 @@ class _Scene:
             if second < 0:
                 yield first, Equality(None, 0.0, self.reference(first) + constant)
             elif any(curve):
-                yield first, "by a polynomial, and Arm handles straight lines"
+                yield first, "by a polynomial, and Arm handles linear couplings only"
             else:
                 shift = self.reference(first) + constant - slope * self.reference(second)
                 yield first, Equality(second, slope, shift)
@@ -190,7 +190,7 @@ class _Scene:
     def _of_tendons(
         self, ends: tuple[int, int], constant: float, slope: float, *, curved: bool
     ) -> Iterator[tuple[int, Equality | str]]:
-        """As `_equalities`, of the length of a tendon and that of another or none: Σ weight · q = constant."""
+        """`_equalities` for the lengths of one tendon or two: Σ weight · q = constant."""
         weights: dict[int, float] = {}
         for tendon, factor in zip(ends, (1.0, -slope), strict=True):
             if tendon < 0:
@@ -202,14 +202,14 @@ class _Scene:
         tendons = " and ".join(repr(self.name("tendon", tendon)) for tendon in ends if tendon >= 0)
         if curved or len(weights) > 2 or any(math.isnan(weight) for weight in weights.values()):
             for joint in weights:
-                yield joint, f"by the tendon {tendons}, and Arm handles two joints in a straight line"
+                yield joint, f"by the tendon {tendons}, and Arm handles linear couplings of two joints only"
         elif weights:
             joint, weight = weights.popitem()
             ratio = -next(iter(weights.values()), 0.0) / weight
             yield joint, Equality(next(iter(weights), None), ratio, constant / weight)
 
     def _joints_of(self, tendon: int) -> Iterator[tuple[int, float]]:
-        """The joints whose positions make a tendon's length, and their weights; NaN where it is no sum of them."""
+        """The joints that determine a tendon's length, and their weights; NaN if the length is not a sum of joints."""
         model, wraps = self.model, self.mujoco.mjtWrap
         first = int(model.tendon_adr[tendon])
         for index in range(first, first + int(model.tendon_num[tendon])):
@@ -226,7 +226,7 @@ class _Scene:
 
 
 class Equality(NamedTuple):
-    """That a joint is at ``ratio · q + shift``, with q the position of another, or at ``shift`` where there is none."""
+    """A joint's position is ``ratio · q + shift``, with q the position of another, or ``shift`` without another."""
 
     driver: int | None
     ratio: float
@@ -234,7 +234,7 @@ class Equality(NamedTuple):
 
 
 def _pose(position: Any, quaternion: Any) -> Tensor:
-    """Transform ``(4, 4)`` float64 of a place ``(3,)`` and a quaternion wxyz ``(4,)``."""
+    """Transform ``(4, 4)`` float64 of a position ``(3,)`` and a quaternion wxyz ``(4,)``."""
     return transform(_rotation_of_quaternion(quaternion), position)
 
 

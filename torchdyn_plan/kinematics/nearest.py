@@ -1,4 +1,4 @@
-"""Which of several joint positions is the nearest to a start: whole turns off, and the time that the way takes."""
+"""Nearest of several joint positions to a start: whole turns removed, compared by travel time."""
 
 from __future__ import annotations
 
@@ -11,16 +11,16 @@ from torchdyn_plan.kinematics.arm import Arm
 
 TURN = 2.0 * math.pi
 DISTINCT = 0.01
-"""Solutions are the same when no joint differs by more [rad; m], whole turns aside."""
+"""Solutions are equal if no joint differs by more than this, apart from whole turns [rad; m]."""
 
 
 def revolute(arm: Arm) -> Tensor:
-    """Which joints turn, and are where they were after a full turn with all that they move, ``(N,)`` bool."""
+    """Revolute joints for which a full turn changes nothing, including what they drive: ``(N,)`` bool."""
     return torch.tensor(arm.full_turns, device=arm.lower.device)
 
 
 def reduced(arm: Arm, q: Tensor) -> Tensor:
-    """``q`` (*B, N) with joints that turn without an end brought to [-π, π], where their precision is the same."""
+    """``q`` (*B, N) with endless joints wrapped to [-π, π], where their precision is uniform."""
     endless = revolute(arm) & arm.lower.isinf() & arm.upper.isinf()
     if not bool(endless.any()):
         return q
@@ -29,9 +29,9 @@ def reduced(arm: Arm, q: Tensor) -> Tensor:
 
 
 def turned_towards(q: Tensor, start: Tensor, lower: Tensor, upper: Tensor) -> Tensor:
-    """Angles ``q`` turned by multiples of 2π to the nearest of ``start`` within the limits, all of one shape.
+    """Angles ``q`` shifted by multiples of 2π to be nearest to ``start`` within the limits; all of one shape.
 
-    An angle outside its limits that no turn brings inside stays as it is.
+    An angle outside its limits that no turn brings inside is left unchanged.
     """
     number = ((start - q) / TURN).round()
     number = torch.minimum(torch.maximum(number, ((lower - q) / TURN).ceil()), ((upper - q) / TURN).floor())
@@ -40,23 +40,23 @@ def turned_towards(q: Tensor, start: Tensor, lower: Tensor, upper: Tensor) -> Te
 
 
 def speeds(arm: Arm) -> Tensor:
-    """What the way of each joint is divided by to be compared with another's: ``(N,)``.
+    """Speeds ``(N,)`` that make the motions of joints comparable as times.
 
-    That is the speed limits [rad/s; m/s], or 1 where the arm does not have them all.
+    These are the speed limits [rad/s; m/s], or 1 if the arm lacks some of them.
     """
     limit = arm.speed_limit
     return limit if bool((limit.isfinite() & (limit > 0)).all()) else torch.ones_like(limit)
 
 
 def travel(q: Tensor, start: Tensor, speed: Tensor) -> Tensor:
-    """Time ``(*B,)`` that the slowest joint takes from ``start`` to ``q``, both (*B, N)."""
+    """Time ``(*B,)`` of the slowest joint from ``start`` to ``q``, both (*B, N)."""
     return ((q - start).abs() / speed).amax(dim=-1)
 
 
 def first_distinct(q: Tensor, key: Tensor, count: int, turns: Tensor) -> Tensor:
-    """Indices ``(M, count)`` of the rows of ``q`` (M, S, N) with the least ``key`` (M, S), each unlike those before.
+    """Indices ``(M, count)`` of distinct rows of ``q`` (M, S, N), in ascending order of ``key`` (M, S).
 
-    Where fewer than ``count`` are left, the index is -1.
+    If there are fewer than ``count``, the remaining indices are -1.
     """
     picked, key = [], key.clone()
     for _ in range(count):

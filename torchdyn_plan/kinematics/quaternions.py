@@ -1,4 +1,4 @@
-"""Unit quaternions wxyz, as tensors ``(*B, 4)``: rotations in four numbers."""
+"""Unit quaternions wxyz as tensors ``(*B, 4)``."""
 
 from __future__ import annotations
 
@@ -6,11 +6,11 @@ import torch
 from torch import Tensor
 
 SHORTEST = 1e-6
-"""A quaternion shorter than this says nothing of a rotation."""
+"""A quaternion shorter than this defines no rotation."""
 
 
 def quat_multiply(first: Tensor, second: Tensor) -> Tensor:
-    """The rotation ``second`` and then ``first``, quaternions ``(*B, 4)`` each: as R₁R₂ of matrices."""
+    """Rotation by ``second``, then by ``first``, quaternions ``(*B, 4)`` each: R₁R₂ in matrices."""
     first, second = torch.broadcast_tensors(first, second)
     w, v = first[..., :1], first[..., 1:]
     u, x = second[..., :1], second[..., 1:]
@@ -19,7 +19,7 @@ def quat_multiply(first: Tensor, second: Tensor) -> Tensor:
 
 
 def quat_matrix(quat: Tensor) -> Tensor:
-    """Rotation matrices ``(*B, 3, 3)`` of quaternions ``(*B, 4)`` of any length; of zeros no rotation."""
+    """Rotation matrices ``(*B, 3, 3)`` of quaternions ``(*B, 4)`` of any length; the identity for zeros."""
     square = quat.square().sum(-1, keepdim=True)
     known = square > SHORTEST**2
     quat = torch.where(known, quat, quat.new_tensor([1.0, 0.0, 0.0, 0.0]))
@@ -33,13 +33,13 @@ def quat_matrix(quat: Tensor) -> Tensor:
 
 
 def quat_between(start: Tensor, end: Tensor) -> Tensor:
-    """The least turn that brings directions ``start`` (*B, 3) to ``end`` (*B, 3), of any length: ``(*B, 4)``.
+    """Smallest rotation from directions ``start`` (*B, 3) to ``end`` (*B, 3), of any length: ``(*B, 4)``.
 
-    Of opposite directions it is half a turn.
+    Opposite directions give a half turn.
     """
     start, end = (torch.nn.functional.normalize(value, dim=-1) for value in torch.broadcast_tensors(start, end))
     scalar = 1.0 + (start * end).sum(-1, keepdim=True)
-    # Opposite directions: about any axis across them, here one that is not along the largest of their entries.
+    # Opposite directions: about any perpendicular axis, here one chosen away from their largest component.
     smallest = torch.nn.functional.one_hot(start.abs().argmin(-1), 3).to(start.dtype)
     across = torch.linalg.cross(start, smallest)
     opposite = scalar < SHORTEST
@@ -50,12 +50,12 @@ def quat_between(start: Tensor, end: Tensor) -> Tensor:
 
 
 def is_turned(quat: Tensor) -> Tensor:
-    """Whether quaternions ``(*B, 4)`` say how something is turned, ``(*B,)`` bool: zeros do not."""
+    """Whether quaternions ``(*B, 4)`` define an orientation, ``(*B,)`` bool: zeros do not."""
     return quat.square().sum(-1) > SHORTEST**2
 
 
 def matrix_quat(rotation: Tensor) -> Tensor:
-    """Unit quaternions ``(*B, 4)`` of rotation matrices ``(*B, 3, 3)``, by the surest of the four ways to read one."""
+    """Unit quaternions ``(*B, 4)`` of rotation matrices ``(*B, 3, 3)``, by the best conditioned of four formulas."""
     # Every row of this matrix is the quaternion, times four of its entries.
     r = rotation
     x, y, z = r.diagonal(dim1=-2, dim2=-1).unbind(-1)

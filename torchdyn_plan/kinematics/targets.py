@@ -1,4 +1,4 @@
-"""What an arm is asked for, a whole pose or less, and how far a pose is from it."""
+"""Targets of an arm, a full pose or part of one, and the error of a pose."""
 
 from __future__ import annotations
 
@@ -13,11 +13,11 @@ from torchdyn_plan.kinematics.arm import Arm
 from torchdyn_plan.precision import autocast_is_on, without_autocast
 
 CONSTRAINTS = {"pose": 6, "axis": 5, "position": 3}
-"""Directions that each constrains: the whole pose, place and direction of the tool's z axis, place."""
+"""Dimension of each constraint: the full pose; position and direction of the tool's z axis; position."""
 
 
 def as_pose(target: Tensor, arm: Arm, constraint: str, *, name: str = "target") -> Tensor:
-    """``target`` as poses ``(*B, 4, 4)``, checked; ``(*B, 3)`` will do for a position."""
+    """``target`` as poses ``(*B, 4, 4)``, checked; ``(*B, 3)`` is allowed for the constraint "position"."""
     if constraint == "position" and isinstance(target, Tensor) and target.shape[-1:] == (3,):
         check_like(name, target, arm)
         place = target.unsqueeze(-1)
@@ -39,14 +39,14 @@ def as_rows(name: str, value: Tensor, arm: Arm, batch: torch.Size) -> Tensor:
 
 
 def check_like(name: str, value: Tensor, arm: Arm) -> None:
-    """Raise `InputError` unless ``value`` is of the arm's device and precision."""
+    """Raise `InputError` unless ``value`` has the arm's device and precision."""
     check_same_device(name, value, arm.lower.device, "the arm")
     if value.dtype != arm.lower.dtype:
         raise InputError(f"{name} is {value.dtype}, but the arm is {arm.lower.dtype}: convert one of them")
 
 
 def is_pose(target: Tensor, constraint: str) -> Tensor:
-    """Whether targets ``(M, 4, 4)`` are finite, and their rotations orthonormal where the constraint has any."""
+    """Whether targets ``(M, 4, 4)`` are finite, and their rotations orthonormal if the constraint uses them."""
     finite = target.isfinite().all(dim=-1).all(dim=-1)
     if constraint == "position":
         return finite
@@ -57,17 +57,17 @@ def is_pose(target: Tensor, constraint: str) -> Tensor:
 
 
 def constraint_error(pose: Tensor, target: Tensor, *, constraint: str = "pose", symmetry: int = 1) -> Tensor:
-    """What is left to go from ``pose`` to ``target``: its place, then its turn.
+    """Error from ``pose`` to ``target``: position, then orientation.
 
     Args:
         pose: ``(*B, 4, 4)``, base frame.
         target: ``(*B, 4, 4)``, base frame.
         constraint: one of `CONSTRAINTS`.
-        symmetry: the tool is the same after one ``symmetry``-th of a turn about its z axis: 4 for a square box.
+        symmetry: order of the tool's rotational symmetry about its z axis: 4 for a square box.
 
     Returns:
-        ``(*B, R)`` [m; rad]. For a pose the turn is a rotation vector in the base frame; for an axis, the turn about
-        the target's x and y axes that brings the tool's z axis there.
+        ``(*B, R)`` [m; rad]. For a pose the orientation error is a rotation vector in the base frame; for an axis, the
+        rotation about the target's x and y axes that aligns the tool's z axis.
     """
     if autocast_is_on():
         return without_autocast(constraint_error, pose, target, constraint=constraint, symmetry=symmetry)
@@ -83,7 +83,7 @@ def constraint_error(pose: Tensor, target: Tensor, *, constraint: str = "pose", 
 
 
 def constraint_jacobian(jacobian: Tensor, target: Tensor, *, constraint: str = "pose") -> Tensor:
-    """Rows of the Jacobian ``(*B, 6, N)`` that move along `constraint_error`: ``(*B, R, N)``."""
+    """Rows of the Jacobian ``(*B, 6, N)`` for `constraint_error`: ``(*B, R, N)``."""
     if constraint == "pose":
         return jacobian
     if constraint == "position":
@@ -96,8 +96,8 @@ def constraint_jacobian(jacobian: Tensor, target: Tensor, *, constraint: str = "
 def rotation_vector(rotation: Tensor) -> Tensor:
     """Axis times angle in [0, π] of rotations ``(*B, 3, 3)``: ``(*B, 3)`` [rad].
 
-    The antisymmetric part gives sin(θ)·axis, whose ratio to θ is smooth at 0; within 0.06 of a half turn, where it
-    vanishes, the axis comes from the symmetric part, in which cos(θ) is -1. Its gradient is exact near no rotation.
+    The antisymmetric part gives sin(θ)·axis, whose ratio to θ is smooth at 0. Within 0.06 rad of a half turn, where it
+    vanishes, the axis comes from the symmetric part, where cos(θ) is -1. The gradient is exact near the identity.
     """
     sine = 0.5 * torch.stack(
         [
@@ -113,7 +113,7 @@ def rotation_vector(rotation: Tensor) -> Tensor:
 
 
 def rotation_matrix(vector: Tensor) -> Tensor:
-    """The rotation ``(*B, 3, 3)`` whose axis times angle is ``vector`` (*B, 3) [rad]: `rotation_vector` undone."""
+    """The rotation ``(*B, 3, 3)`` with rotation vector ``vector`` (*B, 3) [rad]: the inverse of `rotation_vector`."""
     angle = vector.norm(dim=-1).clamp_min(torch.finfo(vector.dtype).tiny)[..., None, None]
     eye = torch.eye(3, dtype=vector.dtype, device=vector.device)
     cross = torch.linalg.cross(vector.unsqueeze(-2).expand(*vector.shape, 3), eye.expand(*vector.shape, 3)).mT
@@ -127,15 +127,15 @@ def _angle_over_sine(sine: Tensor, cosine: Tensor) -> Tensor:
     small = (square < 1e-8) & (cosine > 0)
     norm = torch.where(square < 1e-30, 1e-30, square).sqrt()
     norm = torch.where(small, 1.0, norm)
-    # tan(θ/2) = sin(θ) / (1 + cos(θ)); atan2 rounds differently with the place of a row in its batch.
+    # tan(θ/2) = sin(θ) / (1 + cos(θ)); the rounding of atan2 depends on a row's position in the batch.
     return torch.where(small, 1.0 + square / 6.0, 2.0 * torch.atan(norm / (1.0 + cosine).clamp_min(1e-12)) / norm)
 
 
 def _near_half_turn(rotation: Tensor, sine: Tensor, cosine: Tensor) -> Tensor:
-    """Rotation vector from R + Rᵀ = 2 cos(θ) 1 + 2 (1 - cos(θ)) uuᵀ, whose largest column is the surest."""
+    """Rotation vector from R + Rᵀ = 2 cos(θ) 1 + 2 (1 - cos(θ)) uuᵀ, whose largest column is best conditioned."""
     level = cosine.unsqueeze(-1) * torch.eye(3, dtype=rotation.dtype, device=rotation.device)
     outer = 0.5 * (rotation + rotation.mT) - level
-    # As a mask and a sum, since indexing by a tensor cannot be traced through every transform.
+    # A mask and a sum, because indexing by a tensor cannot be traced through every transform.
     diagonal = outer.diagonal(dim1=-2, dim2=-1)
     chosen = (diagonal == diagonal.amax(dim=-1, keepdim=True)).to(outer.dtype)
     axis = (outer * chosen.unsqueeze(-2)).sum(dim=-1)
@@ -145,7 +145,7 @@ def _near_half_turn(rotation: Tensor, sine: Tensor, cosine: Tensor) -> Tensor:
 
 
 def _tilt(axis: Tensor, wanted: Tensor) -> Tensor:
-    """Turn ``(*B, 2)`` about x and y of ``wanted`` (*B, 3, 3) that brings ``axis`` (*B, 3) to its z axis."""
+    """Rotation ``(*B, 2)`` about x and y of ``wanted`` (*B, 3, 3) that brings ``axis`` (*B, 3) to its z axis."""
     x, y, z = (wanted.mT @ axis.unsqueeze(-1)).squeeze(-1).unbind(-1)
     # (x, y, z) × (0, 0, 1) = (y, -x, 0); exactly opposite axes may turn either way.
     sine = torch.stack([y, -x], dim=-1)

@@ -1,4 +1,4 @@
-"""Forecasts by mechanics, without training; usable wherever a forecaster is expected."""
+"""Forecasts from mechanical models, without training; usable wherever a forecaster is expected."""
 
 from __future__ import annotations
 
@@ -20,18 +20,18 @@ from torchdyn_plan.precision import at_least_float32
 MEDIAN = 0.6744897501960817
 """Half of a normal distribution's errors are smaller than this many standard deviations."""
 SHAPE = math.log(19.0) / math.log(1.959963984540054 / MEDIAN)
-"""With this shape a `Spread` has half of its errors and 95 % of them where a normal distribution has them."""
+"""With this shape the 50 % and 95 % intervals of a `Spread` are those of a normal distribution."""
 LOOK_BACK = 8
-"""Control steps over which a target's loss of speed is judged."""
+"""Control steps over which a target's deceleration is estimated."""
 FINEST = 1e-5
-"""Standard deviations of forecasts are taken for no smaller than this [m]."""
+"""Lower bound on standard deviations of forecasts [m]."""
 
 
 class AnalyticForecast(ForecastModel):
-    """A forecast by a law of motion, from where a target is and how fast it moves.
+    """A forecast by a law of motion from the target's position and velocity.
 
-    The speed is that of the last step of the history, which a `torchdyn_plan.planners.Track` makes smooth. The spread
-    follows from how well both are known, and from what may accelerate the target beside the law.
+    The velocity is that of the last step of the history, which a `torchdyn_plan.planners.Track` smooths. The spread
+    follows from the uncertainty of both, and from accelerations that the law leaves out.
     """
 
     def __init__(
@@ -48,8 +48,8 @@ class AnalyticForecast(ForecastModel):
         Args:
             horizon: steps F.
             control_step: time between two steps [s].
-            tracked: read ``target_covariance``, as a track tells it; else every position in the history is taken to
-                have the error ``noise`` of its own.
+            tracked: read a track's ``target_covariance``; otherwise every position in the history is assumed to have an
+                independent error ``noise``.
             noise: standard deviation of that error along each axis [m].
             acceleration: standard deviation of a constant acceleration along each axis that the law leaves out [m/s²].
         """
@@ -64,17 +64,17 @@ class AnalyticForecast(ForecastModel):
 
     @abstractmethod
     def follow(self, history: Tensor, velocity: Tensor, time: Tensor, deviation: Tensor) -> Forecast:
-        """The forecast at moments ``time`` (F,) from now [s].
+        """The forecast at times ``time`` (F,) from now [s].
 
         Args:
-            history: ``(*B, H, D)``, the target now last [m, world].
+            history: ``(*B, H, D)``, the present position last [m, world].
             velocity: ``(*B, D)`` over the last step [m/s, world].
             time: ``(F,)`` [s].
-            deviation: ``(*B, F)`` standard deviation along each axis of what both lead to [m].
+            deviation: ``(*B, F)`` standard deviation of the forecast position along each axis [m].
         """
 
     def predict(self, *seen: Tensor) -> Forecast:
-        """Path and spread after histories ``(*B, H, D)`` [m, world], and of the history's type."""
+        """Path and spread after histories ``(*B, H, D)`` [m, world], with the history's type."""
         history = seen[0]
         check_points(keys.TARGET_HISTORY, history, history.shape[-2] if history.ndim > 1 else 2)
         history = at_least_float32(history)
@@ -89,7 +89,7 @@ class AnalyticForecast(ForecastModel):
         return {name: getattr(self, name) for name in names}
 
     def _deviation(self, time: Tensor, covariance: Sequence[Tensor], place: Tensor) -> Tensor:
-        """Standard deviation ``(*B, F)`` at moments ``time`` (F,) [s], along each axis [m]."""
+        """Standard deviation ``(*B, F)`` at times ``time`` (F,) [s], along each axis [m]."""
         if covariance:
             check_trailing_shape(keys.TARGET_COVARIANCE, covariance[0], 2, 2)
             of_place, both, of_speed = (
@@ -125,7 +125,7 @@ class Ballistic(AnalyticForecast):
         if len(self.gravity) != history.shape[-1]:
             raise InputError(f"gravity has {len(self.gravity)} numbers, but targets {history.shape[-1]} coordinates")
         falls, moment = time.new_tensor(self.gravity), time.unsqueeze(-1)
-        # The velocity over the last step is that of half a step ago.
+        # The mean velocity over the last step is that of half a step ago.
         speed = velocity + 0.5 * self.control_step * falls
         path = history[..., -1:, :] + moment * speed.unsqueeze(-2) + 0.5 * moment.square() * falls
         return Forecast(path, normal_spread(deviation.unsqueeze(-1).expand(*deviation.shape, 2)))
@@ -136,23 +136,23 @@ class Ballistic(AnalyticForecast):
 
 
 class Rolled(NamedTuple):
-    """Where a ball is along each of two axes between cushions, at F moments."""
+    """Motion of a ball along each of two axes between cushions, at F times."""
 
     place: Tensor
     """``(*B, F, 2)`` [m]."""
     bounces: Tensor
-    """``(*B, F, 2)`` how often it has met a cushion."""
+    """``(*B, F, 2)`` number of bounces."""
     share: Tensor
-    """``(*B, F, 2)`` of its speed that is left."""
+    """``(*B, F, 2)`` remaining share of its speed."""
     since: Tensor
-    """``(*B, F, 2)`` how far it has come since its first bounce [m]."""
+    """``(*B, F, 2)`` distance covered since its first bounce [m]."""
 
 
 class Billiard(AnalyticForecast):
-    """The target rolls on a level table between four cushions, which mirror its path and take some of its speed.
+    """The target rolls on a level table between four cushions, which mirror its path and reduce its speed.
 
-    Where a cushion has a gap, the target falls through: its path goes on at ``gone_height``, and the spread says how
-    likely that is.
+    At a gap in a cushion the target falls through: its path continues at ``gone_height``, and the spread holds the
+    probability of that.
     """
 
     def __init__(
@@ -171,14 +171,14 @@ class Billiard(AnalyticForecast):
 
         Args:
             half_extent: as above.
-            restitution: share of the speed across a cushion that comes back; along it nothing is lost.
-            restitution_deviation: standard deviation of that share.
-            deceleration: at which a rolling target loses speed [m/s²].
-            sliding: at which one does that has bounced, and slides until it rolls again [m/s²]. Whether it slides now
-                shows in its history.
-            gaps: first and last coordinate, along each of the four cushions, between which there is none [m].
-            gone_height: of a target that fell through [m, world].
-            settings: those of `AnalyticForecast`.
+            restitution: restitution coefficient normal to a cushion; tangential speed is kept.
+            restitution_deviation: its standard deviation.
+            deceleration: of a rolling target [m/s²].
+            sliding: deceleration of a target that slides after a bounce, until it rolls again [m/s²]. Whether it slides
+                now is estimated from its history.
+            gaps: first and last coordinate of each gap along each of the four cushions [m].
+            gone_height: height of a target that fell through [m, world].
+            settings: settings of `AnalyticForecast`.
         """
         super().__init__(**settings)
         check_number("half_extent", half_extent, minimum=1e-9)
@@ -204,15 +204,15 @@ class Billiard(AnalyticForecast):
         if falls is None:
             return Forecast(torch.cat([rolled.place, height], dim=-1), normal_spread(wide))
         gone = 1.0 - (1.0 - falls).cumprod(-1)
-        # The path is of the likelier of two ends.
+        # The path takes the likelier of the two outcomes.
         height = torch.where(gone.unsqueeze(-1) > 0.5, self.gone_height, height)
         return Forecast(torch.cat([rolled.place, height], dim=-1), normal_spread(wide, gone))
 
     def roll(self, place: Tensor, velocity: Tensor, time: Tensor) -> Rolled:
         """Roll from ``place`` with ``velocity`` (*B, 1, 2) for ``time`` (*B, F, 1) [s].
 
-        The path is unfolded: each crossing of the table takes 1/e times as long as the one before, so that the number
-        of bounces and what is left after the last one follow from a geometric series.
+        The path is unreflected: each crossing of the table takes 1/e times as long as the last, so that the number of
+        bounces and the remainder after the last one follow from a geometric series.
         """
         half, e = self.half_extent, self.restitution
         heading, speed = torch.where(velocity < 0.0, -1.0, 1.0), velocity.abs()
@@ -248,7 +248,7 @@ class Billiard(AnalyticForecast):
         return super().part_settings() | {name: getattr(self, name) for name in names}
 
     def _slowed(self, history: Tensor, velocity: Tensor, time: Tensor) -> Tensor:
-        """How long a target of constant ``velocity`` (*B, 1, 2) would take for what it covers: ``(*B, F, 1)`` [s]."""
+        """Time in which a target at constant ``velocity`` (*B, 1, 2) covers the same distance: ``(*B, F, 1)`` [s]."""
         moment = time.unsqueeze(-1)
         if self.deceleration == self.sliding == 0.0:
             return moment
@@ -257,7 +257,7 @@ class Billiard(AnalyticForecast):
         place, heading = history[..., -1:, :], torch.where(velocity < 0.0, -1.0, 1.0)
         waits = (self.half_extent - place * heading).clamp_min(0.0) / velocity.abs().clamp_min(1e-9)
         first, axis = waits.min(-1, keepdim=True)
-        # Of the speed across the cushion a share is left, and all of the one along it.
+        # Part of the normal speed is left, and all of the tangential speed.
         left = velocity * torch.where(torch.arange(2, device=axis.device) == axis, self.restitution, 1.0)
         after = left.square().sum(-1, keepdim=True).clamp_min(1e-12).sqrt()
         free = torch.minimum(moment, first)
@@ -265,25 +265,25 @@ class Billiard(AnalyticForecast):
         return _covered(free, before / speed) + _covered(rest, self.sliding / after)
 
     def _braking(self, history: Tensor) -> Tensor:
-        """The deceleration now, between that of rolling and of sliding, from positions (*B, H, 2): ``(*B, 1, 1)``."""
+        """Present deceleration, between rolling and sliding, from positions (*B, H, 2): ``(*B, 1, 1)``."""
         least, most = sorted((self.deceleration, self.sliding))
         if history.shape[-2] <= LOOK_BACK + 2:
             return torch.full_like(history[..., -1:, :1], least)
         moves = (history[..., 2:, :] - history[..., :-2, :]) / (2.0 * self.control_step)
         now, then = (moves[..., -1 - back, :].square().sum(-1) for back in (0, LOOK_BACK))
-        # The root's derivative at rest is not a number.
+        # The root's derivative at rest is infinite.
         now, was = (value.clamp_min(1e-12).sqrt() for value in (now, then))
         braking = ((was - now) / (LOOK_BACK * self.control_step)).clamp(least, most)
         # Histories are padded with their first position.
         return torch.where(then > 1e-12, braking, least)[..., None, None]
 
     def _falls(self, rolled: Rolled, deviation: Tensor, start: Tensor) -> Tensor | None:
-        """Probability that the target falls through a gap between one step and the next, ``(*B, F)``."""
+        """Probability that the target falls through a gap in each step, ``(*B, F)``."""
         if not self.gaps:
             return None
         met = torch.diff(rolled.bounces, dim=-2, prepend=torch.zeros_like(rolled.bounces[..., :1, :])) > 0.0
         before = torch.cat([start.expand_as(rolled.place[..., :1, :]), rolled.place[..., :-1, :]], dim=-2)
-        # Where the other coordinate is in the midst of the step.
+        # The other coordinate in the middle of the step.
         across, wide = (0.5 * (before + rolled.place)).flip(-1), deviation.flip(-1)
         found = torch.zeros_like(across)
         for first, last in self.gaps:
@@ -292,12 +292,12 @@ class Billiard(AnalyticForecast):
 
 
 def _covered(time: Tensor, braking: Tensor) -> Tensor:
-    """What is covered in ``time`` [s] at speed 1, of which ``braking`` [1/s] takes away until nothing is left."""
+    """Distance covered in ``time`` [s] from speed 1, with deceleration ``braking`` [1/s] until rest."""
     moving = torch.minimum(time, 1.0 / braking.clamp_min(1e-9))
     return moving - 0.5 * braking * moving.square()
 
 
 def normal_spread(deviation: Tensor, gone: Tensor | None = None) -> Spread:
-    """The spread nearest to a normal distribution with ``deviation`` (*B, F, 2) along x and y [m]; surely not gone."""
+    """The spread nearest to a normal distribution with ``deviation`` (*B, F, 2) [m]; ``gone`` is 0 for None."""
     gone = torch.zeros_like(deviation[..., 0]) if gone is None else gone
     return Spread(MEDIAN * deviation, torch.full_like(deviation, SHAPE), gone)

@@ -1,4 +1,4 @@
-"""Arrival times of an arm from the limits of its joints, without training or simulation."""
+"""Arrival times of an arm from its joint limits, without training or simulation."""
 
 from __future__ import annotations
 
@@ -20,24 +20,24 @@ from torchdyn_plan.precision import Precise, at_least_float32
 
 
 class GoalJoints(Protocol):
-    """Tells where the joints are when the tool is at a goal; a `torchdyn_plan.planners.IKPlanner` does."""
+    """Gives the joint positions at a goal; a `torchdyn_plan.planners.IKPlanner` is one."""
 
     def goal_joints(self, joint_pos: Tensor, goal: Tensor, /) -> tuple[Tensor, Tensor]:
-        """Joints ``(*B, N)`` from ``joint_pos`` (*B, N) at ``goal`` (*B, 3) [m, world], and whether it is reached.
+        """Joints ``(*B, N)`` at ``goal`` (*B, 3) [m, world], from ``joint_pos`` (*B, N), and whether it is reached.
 
-        With a ``goal_size`` of 7 goals are poses, as ``goal_pose`` is.
+        With a ``goal_size`` of 7, goals are poses like ``goal_pose``.
         """
         ...
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class SolvedJoints:
-    """Joints by `solve_ik`: of all solutions found, the one that is reached soonest."""
+    """Joints from `solve_ik`: of all solutions found, the one reached soonest."""
 
     arm: Arm
-    """Whose tool is at the goal."""
+    """The arm."""
     rotation: tuple[tuple[float, float, float], ...] | None = None
-    """How the tool is turned there, row by row, in the arm's base frame; None for any way."""
+    """Rotation matrix of the tool at the goal, row by row, in the arm's base frame; None for any orientation."""
     base_pos: tuple[float, float, float] = (0.0, 0.0, 0.0)
     """Position of the arm's base frame in the world, axes parallel [m]."""
 
@@ -56,10 +56,11 @@ class SolvedJoints:
 
 
 class AnalyticArrival(Precise, ArrivalModel):
-    """Arrival of an arm whose joints all move as fast as they may, and stop at the goal together.
+    """Arrival of an arm whose joints move at their limits and stop at the goal together.
 
-    Joints go straight to where they are at the goal, with trapezoidal speed: the time of the slowest is the least that
-    any controller can need on that way, the present speed included. What a controller adds by its own, it is told.
+    Joints move straight to their goal positions with trapezoidal speed profiles, starting from their present speeds:
+    the time of the slowest joint is a lower bound for any controller on that path. Delays of the controller are
+    settings.
     """
 
     speed: Tensor
@@ -75,20 +76,20 @@ class AnalyticArrival(Precise, ArrivalModel):
         extra_steps: float = 0.0,
         slowdown: float = 1.0,
     ) -> None:
-        """Arrive at the joints that ``joints`` tells.
+        """Make the model.
 
         Args:
-            joints: tells the joints of a goal.
+            joints: gives the joints of a goal.
             speed: limits of the N joints [rad/s; m/s].
             acceleration: limits of the N joints [rad/s²; m/s²].
             control_step: time between two control steps [s].
-            extra_steps: control steps that the controller needs beside, its lag and to settle; fewer than none where a
-                tool counts as there before it has stopped.
-            slowdown: times longer that the controller takes than the limits allow.
+            extra_steps: additional control steps of the controller, for lag and settling; negative if a tool counts as
+                arrived before it has stopped.
+            slowdown: factor by which the controller is slower than the limits allow.
         """
         super().__init__()
         if not hasattr(joints, "goal_joints"):
-            raise InputError(f"joints must have goal_joints, as an IKPlanner, got {type(joints).__name__}")
+            raise InputError(f"joints must have goal_joints, like an IKPlanner, got {type(joints).__name__}")
         check_number("control_step", control_step, minimum=1e-6)
         check_number("extra_steps", extra_steps)
         check_number("slowdown", slowdown, minimum=1e-3)
@@ -100,14 +101,14 @@ class AnalyticArrival(Precise, ArrivalModel):
             self.register_buffer(name, given, persistent=False)
         if self.speed.shape != self.acceleration.shape:
             counts = f"{len(self.speed)} and {len(self.acceleration)}"
-            raise InputError(f"speed and acceleration must be of as many joints, got {counts}")
+            raise InputError(f"speed and acceleration must have equally many joints, got {counts}")
         self.joints, self.control_step = joints, control_step
         self.extra_steps, self.slowdown = extra_steps, slowdown
 
     def arrival(self, robot_state: Tensor, goal: Tensor, *, estimator: str = "mode") -> Arrival:
-        """Arrival ``(*B, K)`` at goals (*B, K, 3) [m, world], by any estimator; never where no joints reach one.
+        """Arrival ``(*B, K)`` at goals (*B, K, 3) [m, world], with any estimator; *never* if no joints reach a goal.
 
-        Where its joints have a ``goal_size`` of 7, goals are poses.
+        If its joints have a ``goal_size`` of 7, goals are poses.
 
         ``robot_state`` (*B, 1, S) begins with the joints' positions and speeds, N of each.
         """
@@ -121,7 +122,7 @@ class AnalyticArrival(Precise, ArrivalModel):
         return Arrival(self.steps(there - joint_pos, joint_vel), ~reached)
 
     def steps(self, offset: Tensor, velocity: Tensor) -> Tensor:
-        """Control steps ``(*B,)`` until joints that move with ``velocity`` (*B, N) rest ``offset`` (*B, N) away."""
+        """Control steps ``(*B,)`` until joints with ``velocity`` (*B, N) come to rest ``offset`` (*B, N) away."""
         speed, acceleration = self.speed.to(offset.dtype), self.acceleration.to(offset.dtype)
         seconds = arrival_time(offset, velocity, speed, acceleration)
         return (seconds * (self.slowdown / self.control_step) + self.extra_steps).clamp_min(0.0)

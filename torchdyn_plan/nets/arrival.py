@@ -16,7 +16,7 @@ from torchdyn_plan.precision import in_type_of
 
 
 class ArrivalQuery(Protocol):
-    """What a goal search asks: arrivals of robots in given states, at goals that come later."""
+    """Arrivals of robots in fixed states; a goal search calls it with goals."""
 
     def __call__(self, goal: Tensor, *, estimator: str = "mode") -> Arrival:
         """Arrivals ``(*B, K)`` at goals ``(*B, K, D)`` [m, world]."""
@@ -24,7 +24,7 @@ class ArrivalQuery(Protocol):
 
 
 class ArrivalModel(nn.Module, ABC):
-    """Predicts how long a static planner needs to a goal; `torchdyn_plan.nets.ETANetwork` is one."""
+    """Predicts the time a static planner needs to a goal, such as `torchdyn_plan.nets.ETANetwork`."""
 
     @abstractmethod
     def arrival(self, robot_state: Tensor, goal: Tensor, *, estimator: str = "mode") -> Arrival:
@@ -34,7 +34,7 @@ class ArrivalModel(nn.Module, ABC):
         """
 
     def from_state(self, robot_state: Tensor) -> ArrivalQuery:
-        """Arrivals from ``robot_state`` (*B, S): the state's part of the work is done once, where that can be."""
+        """Arrivals from ``robot_state`` (*B, S); work that depends on the state only is done once, if possible."""
         return partial(self.arrival, robot_state.unsqueeze(-2))
 
     def for_inference(self) -> ArrivalModel:
@@ -60,6 +60,6 @@ class FunctionArrival(ArrivalModel):
         return cls(model)
 
     def arrival(self, robot_state: Tensor, goal: Tensor, *, estimator: str = "mode") -> Arrival:
-        """What the function returns, steps in the goals' type; those that are infinite are *never*."""
+        """The function's result, with steps in the goals' type; infinite steps are *never*."""
         found = self.function(robot_state, goal)
         return found if isinstance(found, Arrival) else Arrival(in_type_of(goal, found), torch.isinf(found))

@@ -1,4 +1,4 @@
-"""Two forecasters of the same targets, of which the noise of what is measured chooses one."""
+"""Two forecasters of the same targets, selected by the measurement noise."""
 
 from __future__ import annotations
 
@@ -10,22 +10,22 @@ from torchdyn_plan.checks import check_number
 from torchdyn_plan.nets.forecast import Forecast, ForecastModel
 
 LEAST_NOISE = 5e-4
-"""Standard deviation from which on a measurement counts as noisy [m]."""
+"""Standard deviation from which a measurement counts as noisy [m]."""
 
 
 class ForecastByNoise(ForecastModel):
-    """Forecasts targets that are seen exactly; and holds another forecaster for those measured with noise.
+    """Forecasts exactly observed targets, and holds another forecaster for noisy measurements.
 
-    A `torchdyn_plan.planners.TrackedPlanner` takes the one for the noise of its track.
+    A `torchdyn_plan.planners.TrackedPlanner` selects the one for its track's noise.
     """
 
     def __init__(self, exact: ForecastModel, noisy: ForecastModel, *, least_noise: float = LEAST_NOISE) -> None:
         """Hold both.
 
         Args:
-            exact: forecasts, and does so alone wherever nobody asks for another.
-            noisy: for targets that a track sees.
-            least_noise: standard deviation of a measurement's error along each axis from which on it is taken [m].
+            exact: the default forecaster.
+            noisy: forecaster for targets seen through a track.
+            least_noise: standard deviation of the measurement error along each axis from which ``noisy`` is used [m].
         """
         super().__init__()
         check_number("least_noise", least_noise, minimum=0.0)
@@ -34,11 +34,11 @@ class ForecastByNoise(ForecastModel):
 
     @property
     def chosen(self) -> ForecastModel:
-        """The one that forecasts."""
+        """The forecaster in use."""
         return self.exact.chosen
 
     def predict(self, *seen: Tensor) -> Forecast:
-        """As of the one for targets that are seen exactly."""
+        """The forecast of ``exact``."""
         return self.exact.predict(*seen)
 
     def for_noise(self, noise: float) -> ForecastModel:
@@ -46,7 +46,7 @@ class ForecastByNoise(ForecastModel):
         return self.noisy if noise >= self.least_noise else self
 
     def for_inference(self) -> ForecastModel:
-        """Both in as few operations as possible."""
+        """Both forecasters prepared for inference, in as few operations as possible."""
         return type(self)(self.exact.for_inference(), self.noisy.for_inference(), least_noise=self.least_noise)
 
     def part_settings(self) -> dict[str, Any]:

@@ -17,17 +17,17 @@ class Arrival(NamedTuple):
     """When, and whether, the robot arrives at each of some goals."""
 
     steps: Tensor
-    """``(*B,)`` control steps from now, of the goals' type, in float32 at least; where ``never`` is True, if it arrived
-    after all."""
+    """``(*B,)`` control steps from now, of the goals' type, in float32 at least; where ``never`` is True, the steps if
+    it arrived after all."""
     never: Tensor
-    """``(*B,)`` bool: the goal is never reached; by the estimator ``soft``, the probability of that."""
+    """``(*B,)`` bool: the goal is never reached; with the estimator ``soft``, the probability of that."""
     bins: Tensor | None = None
-    """``(*B, bins)`` probability of arriving within each bin of time, what is missing to 1 being that of *never*; None
-    where only the time itself is known."""
+    """``(*B, bins)`` probability of arriving within each bin of time; the remainder to 1 is that of *never*. None if
+    only the time is known."""
     bin_width: int = 1
     """Control steps in a bin."""
     passed: int = 0
-    """Control steps that have passed since the moment from which the bins count."""
+    """Control steps that have passed since the start of the first bin."""
 
     def by(self, time: Tensor) -> Tensor:
         """P(the robot is there ``time`` (*B,) control steps from now): ``(*B,)``, linear within a bin."""
@@ -39,23 +39,23 @@ class Arrival(NamedTuple):
         return (self.bins * filled).sum(-1).clamp(0.0, 1.0)
 
     def after(self, steps: int) -> Arrival:
-        """The same counted from ``steps`` control steps later, as of a robot that has gone on to the goal meanwhile."""
+        """The same, counted from ``steps`` control steps later, for a robot that has kept moving to the goal."""
         if steps == 0:
             return self
         return self._replace(steps=(self.steps - steps).clamp_min(0.0), passed=self.passed + steps)
 
 
 class Spread(NamedTuple):
-    """Distribution of a forecast's error, along x and y on its own and symmetric about the forecast.
+    """Distribution of a forecast's error, independent along x and y and symmetric about the forecast.
 
     The size of the error is log-logistic, P(|e| ≤ r) = 1 / (1 + (scale/r)^shape): half of all errors are smaller than
-    ``scale``, and the tail is as heavy as r^-shape, for a forecast is either right or has missed a bounce.
+    ``scale``, and the tail falls as r^-shape. It is heavy because a forecast is either right or has missed a bounce.
     """
 
     scale: Tensor
     """``(*B, F, 2)`` median of the error's size along x and y at 1 … F steps [m]."""
     shape: Tensor
-    """``(*B, F, 2)`` how sharply it is known, positive."""
+    """``(*B, F, 2)`` shape, positive; larger values have lighter tails."""
     gone: Tensor
     """``(*B, F)`` probability that the target is lost by then."""
 
@@ -69,14 +69,14 @@ class Spread(NamedTuple):
         return Spread(self.scale[..., steps:, :], self.shape[..., steps:, :], self.gone[..., steps:])
 
     def within(self, size: Tensor | float) -> Tensor:
-        """P(|e| ≤ size), ``(*B, F, 2)``, of sizes that broadcast against it [m]; 0 for sizes that are not positive."""
+        """P(|e| ≤ size), ``(*B, F, 2)``, for sizes that broadcast against it [m]; 0 for sizes that are not positive."""
         size = torch.as_tensor(size, dtype=self.scale.dtype, device=self.scale.device)
         # A guard on both sides of the `where` keeps the gradient finite.
         exponent = self.shape * (size.clamp_min(1e-12).log() - self.scale.log())
         return torch.where(size > 0.0, exponent.sigmoid(), 0.0)
 
     def between(self, offset: Tensor, half_width: Tensor | float) -> Tensor:
-        """P(|offset + e| ≤ half_width) along each axis, for a place that is ``offset`` from the forecast [m]."""
+        """P(|offset + e| ≤ half_width) along each axis, for a position ``offset`` from the forecast [m]."""
         offset = offset.abs()
         near, far = self.within(torch.stack([half_width + offset, (half_width - offset).abs()])).unbind(0)
         return 0.5 * (near + torch.where(offset <= half_width, far, -far))

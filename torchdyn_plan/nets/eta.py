@@ -1,4 +1,4 @@
-"""When the robot can be somewhere: a classifier of arrival times, as a static planner would drive it there."""
+"""Estimated time of arrival: a classifier of the time a static planner needs to a goal."""
 
 from __future__ import annotations
 
@@ -30,8 +30,8 @@ class ETAConfig:
     bins: int = 100
     """Bins of arrival time."""
     never: bool = True
-    """Whether one more class means *never arrives*. Without it, as in the paper, the time to a place out of reach is
-    that until the robot is as near as it can come."""
+    """Whether there is a further class *never arrives*. Without it, as in the paper, the time to a goal out of reach is
+    the time until the robot is as near as it can get."""
     bin_width: int = 5
     """Control steps in a bin."""
     hidden: int = 192
@@ -50,7 +50,7 @@ class ETAConfig:
 
     @property
     def coordinates(self) -> int:
-        """Coordinates D of goals, those of the tool's place."""
+        """Coordinates D of goals, equal to those of the tool position."""
         return self.tool_slice[1] - self.tool_slice[0]
 
 
@@ -58,7 +58,7 @@ class ETANetwork(Pretrained, Precise, ArrivalModel):
     """Estimated time of arrival P_ETA^R (paper, Section III-B.3): robot state and goal to a distribution over time.
 
     Three hidden linear + ReLU layers and a linear one. Features of the state enter the first layer separately from
-    those of the goal (its place, its offset and distance from the tool), so many goals share one state's work.
+    those of the goal (its position, its offset and distance from the tool), so many goals share one state's work.
     Inputs are standardised by buffers that `set_input_statistics` fills from training data.
     """
 
@@ -93,12 +93,12 @@ class ETANetwork(Pretrained, Precise, ArrivalModel):
             getattr(self, f"{name}_shift").copy_(-values.mean(dim=0) * scale)
 
     def forward(self, robot_state: Tensor, goal: Tensor) -> Tensor:
-        """Scores of the bins; the last one stands for *never arrives*, and is -∞ where the network has no such class.
+        """Scores of the bins; the last one stands for *never arrives*, and is -∞ if the network has no such class.
 
         Args:
             robot_state: ``(*B, S)``; its batch broadcasts against the goal's, ``(*B, 1, S)`` with ``(*B, K, D)``
                 serves K goals from one state.
-            goal: ``(*B, D)`` places to reach [m, world].
+            goal: ``(*B, D)`` goals [m, world].
 
         Returns:
             ``(*B, bins + 1)`` logits, of the goals' type.
@@ -137,7 +137,7 @@ class ETANetwork(Pretrained, Precise, ArrivalModel):
         return ESTIMATORS[estimator](self(robot_state, goal), bin_width=self.config.bin_width)
 
     def for_inference(self) -> InferenceETA:
-        """A copy of the weights as they are now, in fewer operations; it does not follow later training."""
+        """A copy for inference with the current weights, in fewer operations; it does not follow later training."""
         from torchdyn_plan.nets.inference import InferenceETA
 
         return InferenceETA(self)
@@ -152,9 +152,9 @@ class ETANetwork(Pretrained, Precise, ArrivalModel):
 
 
 def arrival_classes(arrival: Tensor, *, bins: int = 100, bin_width: int = 5) -> tuple[Tensor, Tensor]:
-    """Target distribution for cross-entropy: an arrival time between two bins' middles is shared by the two.
+    """Target distribution for cross-entropy: an arrival time between the centres of two bins is shared by the two.
 
-    With it the expectation is unbiased below a bin's width, and the likeliest bin is still the one that holds the time.
+    This makes the expectation unbiased below a bin's width, and the likeliest bin is still the one with the time.
 
     Args:
         arrival: ``(n,)`` int64 control steps, negative or beyond the bins for *never*.

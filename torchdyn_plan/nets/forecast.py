@@ -34,17 +34,17 @@ class Forecast(NamedTuple):
 
 
 class ForecastModel(nn.Module, ABC):
-    """Forecasts a target's path from what it reads, ``in_keys`` of the observation, by default the target's history."""
+    """Forecasts a target's path from the keys ``in_keys`` of the observation, by default the target's history."""
 
     in_keys: Sequence[Any] = (keys.TARGET_HISTORY,)
     history: int | None = None
-    """Positions H that it reads of the target's history; None for any number."""
+    """Length H of the history it reads; None for any length."""
     samples: int | None = None
-    """Samples of a target, as a track shows it, from which on its forecasts are of use; None where nobody says."""
+    """Number of measurements by a track from which its forecasts are usable; None if unknown."""
 
     @abstractmethod
     def predict(self, *seen: Tensor) -> Forecast:
-        """Forecast from the entries ``in_keys``, ``(*B, …)`` each."""
+        """Forecast from the values of ``in_keys``, ``(*B, …)`` each."""
 
     @property
     def chosen(self) -> ForecastModel:
@@ -52,7 +52,7 @@ class ForecastModel(nn.Module, ABC):
         return self
 
     def for_noise(self, noise: float) -> ForecastModel:
-        """The model for targets that a track sees by measurements of standard deviation ``noise`` [m]; itself."""
+        """The model for targets tracked from measurements of standard deviation ``noise`` [m]; by default itself."""
         return self
 
     def for_inference(self) -> ForecastModel:
@@ -64,7 +64,7 @@ class FunctionForecast(ForecastModel):
     """A function as a forecast model."""
 
     def __init__(self, function: Callable[..., Any], *, in_keys: Sequence[Any] = (keys.TARGET_HISTORY,)) -> None:
-        """Wrap ``function`` (an `nn.Module` too): the entries ``in_keys`` to a path (*B, F, D) or a `Forecast`."""
+        """Wrap ``function`` (or an `nn.Module`): the values of ``in_keys`` to a path (*B, F, D) or a `Forecast`."""
         super().__init__()
         self.function, self.in_keys = function, tuple(in_keys)
 
@@ -78,7 +78,7 @@ class FunctionForecast(ForecastModel):
         return cls(model)
 
     def predict(self, *seen: Tensor) -> Forecast:
-        """What the function returns."""
+        """The function's result."""
         found = self.function(*seen)
         return found if isinstance(found, Forecast) else Forecast(found)
 
@@ -107,9 +107,9 @@ class DescribedForecast(ForecastModel):
 def in_plane(
     forecast: Callable[..., tuple[Tensor, Tensor, Tensor]], target_history: Tensor, *beside: Any
 ) -> tuple[Tensor, Tensor, Tensor]:
-    """What ``forecast`` makes of histories (*B, H, 2) at height 0 and what is ``beside`` them.
+    """Result of ``forecast`` for histories (*B, H, 2) taken at height 0, and the further inputs ``beside``.
 
-    Of its path, the first entry, x and y alone.
+    Its path, the first entry, is reduced to x and y.
     """
     path, *others = forecast(nn.functional.pad(target_history, (0, 1)), *beside)
     return path[..., :2], others[0], others[1]

@@ -1,4 +1,4 @@
-"""Where the target will be: a convolutional network that emits the whole horizon at once, without recurrence."""
+"""Trajectory forecasting: a convolutional network that emits the whole horizon at once, without recurrence."""
 
 from __future__ import annotations
 
@@ -27,33 +27,33 @@ class ForecasterConfig:
     """Sizes of a `Forecaster`, and its prior knowledge of the space in which the target moves."""
 
     history: int = 24
-    """Positions H that it sees, the newest included."""
+    """Positions H that it reads, including the newest."""
     horizon: int = 300
     """Positions F that it emits."""
     channels: int = 32
-    """Features of a step after embedding and after each convolution."""
+    """Features per step after the embedding and after each convolution."""
     convolutions: int = 3
     """Convolutions over the history, each of stride 2."""
     hidden: int = 384
     """Width of the two layers between convolutions and head."""
     rank: int = 64
-    """Rank of the head: forecasts are mixtures of that many shapes of path, which are learned."""
+    """Rank of the head: forecasts are mixtures of this many learned path shapes."""
     step_scale: float = 0.02
-    """Length of a step that counts as one [m]: fast motion over one control step."""
+    """Unit for the length of a step [m]: fast motion over one control step."""
     length_scale: float = 0.75
-    """Distance from the origin that counts as one [m]."""
+    """Unit for the distance from the origin [m]."""
     height_scale: float = 0.05
-    """Height that counts as one [m]."""
+    """Unit for height [m]."""
     change_scale: float = 2e-5
-    """Difference between two steps that counts as one [m]: what braking changes in a few control steps."""
+    """Unit for the difference of two steps [m]: the effect of braking over a few control steps."""
     half_extent: float | None = None
-    """Where the target's centre turns back at a square table's cushions, |x| or |y| [m]; None where space is open."""
+    """Where the target's centre turns back at a square table's cushions, |x| or |y| [m]; None for open space."""
     square_symmetry: bool = False
-    """Whether mirrored or turned histories (about z, by quarters) have exactly mirrored or turned forecasts."""
+    """Whether mirrored or rotated histories (about z, by quarter turns) have exactly mirrored or rotated forecasts."""
     stride: int = 1
-    """Of the history every so many positions are read, the newest included."""
+    """Stride at which the history is read, including the newest position."""
     tracked: bool = False
-    """Whether it reads besides how well position and velocity are known, as a `torchdyn_plan.planners.Track` says."""
+    """Whether it also reads the covariance of position and velocity from a `torchdyn_plan.planners.Track`."""
 
     def __post_init__(self) -> None:
         check_number("history", self.history, minimum=2, integer=True)
@@ -75,9 +75,9 @@ class ForecasterConfig:
 class Forecaster(Pretrained, Precise, DescribedForecast):
     """Trajectory forecasting network P_traj^O (paper, eq. 2), after the convolutional one of Nikhil & Morris (2018).
 
-    Relative displacements are embedded step by step, convolved over the history, joined with the newest position and
-    step, and turned by one linear head into all F positions, as departures from constant velocity. On a table with
-    cushions it forecasts a line that runs on through them, and reflects it (`torchdyn_plan.nets.reflection`).
+    Displacements are embedded step by step, convolved over the history, concatenated with the newest position and step,
+    and mapped by one linear head to all F positions, as deviations from constant velocity. On a table with cushions it
+    forecasts a line that runs on through them, and then reflects it (`torchdyn_plan.nets.reflection`).
     """
 
     kind = "forecaster"
@@ -130,26 +130,26 @@ class Forecaster(Pretrained, Precise, DescribedForecast):
 
         Args:
             target_history: ``(*B, H, D)`` positions, oldest first; rows before the first sample repeat it [m, world].
-                Targets in a plane, D = 2, are those at height 0.
-            target_covariance: ``(*B, 2, 2)`` of position and velocity along each axis, for a network that is
-                ``tracked`` [m², m²/s; m²/s, m²/s²].
+                Targets in a plane, D = 2, are taken at height 0.
+            target_covariance: ``(*B, 2, 2)`` of position and velocity along each axis, for a ``tracked`` network
+                [m², m²/s; m²/s, m²/s²].
 
         Returns:
             ``(*B, F, D)``, of the history's type: entry e-1 is the position in e steps [m, world].
 
         Raises:
-            InputError: an argument is missing, or has another shape, another device than the network, or holds a NaN.
+            InputError: an argument is missing, has the wrong shape or device, or holds a NaN.
         """
         return self._forecast(target_history, target_covariance, reflected=self.config.half_extent is not None)[0]
 
     def describe(
         self, target_history: Tensor, target_covariance: Tensor | None = None
     ) -> tuple[Tensor, Tensor, Tensor]:
-        """The same forecast, and what a `torchdyn_plan.nets.SpreadNetwork` judges it by.
+        """The same forecast, and the features that a `torchdyn_plan.nets.SpreadNetwork` reads.
 
         Returns:
             Positions (*B, F, 3) [m, world] and the last hidden layer (*B, hidden), of the history's type (the latter in
-            float32 at least), and whether x and y are exchanged in it (*B,): mirrored and turned histories share their
+            float32 at least), and whether x and y are swapped in it (*B,): mirrored and rotated histories share their
             features.
         """
         reflected = self.config.half_extent is not None
@@ -158,11 +158,11 @@ class Forecaster(Pretrained, Precise, DescribedForecast):
         return forecast, in_type_of(forecast, features).view(*batch, self.config.hidden), swapped.view(batch)
 
     def unreflected(self, target_history: Tensor, target_covariance: Tensor | None = None) -> Tensor:
-        """Same as `forward` before cushions reflect the line: what training compares, ``(*B, F, 3)`` [m, world]."""
+        """`forward` before the line is reflected at cushions, as compared in training: ``(*B, F, 3)`` [m, world]."""
         return self._forecast(target_history, target_covariance, reflected=False)[0]
 
     def for_inference(self) -> InferenceForecaster:
-        """A copy of the weights as they are now, in fewer operations; it does not follow later training."""
+        """A copy for inference with the current weights, in fewer operations; it does not follow later training."""
         from torchdyn_plan.nets.inference import InferenceForecaster
 
         return InferenceForecaster(self)
@@ -170,7 +170,7 @@ class Forecaster(Pretrained, Precise, DescribedForecast):
     def _forecast(
         self, target_history: Tensor, target_covariance: Tensor | None, *, reflected: bool
     ) -> tuple[Tensor, Tensor, Tensor]:
-        """Positions (*B, F, 3), hidden features (R, hidden) and whether x and y are exchanged in them (R,)."""
+        """Positions (*B, F, 3), hidden features (R, hidden) and whether x and y are swapped in them (R,)."""
         if autocast_is_on():
             return without_autocast(self._forecast, target_history, target_covariance, reflected=reflected)
         if target_history.shape[-1] == 2:
@@ -180,7 +180,7 @@ class Forecaster(Pretrained, Precise, DescribedForecast):
         history, turn = seen.reshape(-1, config.history, 3), None
         if config.square_symmetry:
             now, before = history[:, -1, :2], history[:, -2, :2]
-            # A pinch of position decides for a target that moves along an axis or lies still.
+            # A small share of the position breaks ties for a target that moves along an axis or rests.
             turn = self.symmetries[octant(torch.add(now - before, now, alpha=1e-6))]
             history = torch.bmm(history, turn)
         known = None
@@ -198,10 +198,9 @@ class Forecaster(Pretrained, Precise, DescribedForecast):
         return path if path.dtype == target_history.dtype else path.to(target_history.dtype), hidden, swapped
 
     def _line(self, history: Tensor, known: Tensor | None) -> tuple[Tensor, Tensor]:
-        """Unreflected positions (R, 3, F) after the turned histories (R, H, 3) [m], and the last hidden layer.
+        """Unreflected positions (R, 3, F) for the rotated histories (R, H, 3) [m], and the last hidden layer.
 
-        ``known`` (R, 3) is what `how_well_known` says. Features and what the layers make of them have the type of the
-        layers' weights.
+        ``known`` (R, 3) is from `how_well_known`. Features and hidden values have the type of the layers' weights.
         """
         now, step = history[:, -1], history[:, 1:] - history[:, :-1]
         if self.config.stride > 1:
@@ -221,14 +220,14 @@ class Forecaster(Pretrained, Precise, DescribedForecast):
         return torch.addcmul(straight, departure, self.departure_scale), hidden
 
     def _step_features(self, step: Tensor) -> Tensor:
-        """Each step, its difference from the newest one, and whether it is no padding, ``(R, H-1, 7)``."""
+        """Each step, its difference from the newest one, and whether it is not padding, ``(R, H-1, 7)``."""
         real = (step != 0).any(dim=-1, keepdim=True)
-        # Braking changes a step by a thousandth, a bounce by twice itself: a logarithm shows both.
+        # Braking changes a step by a thousandth of it, a bounce by twice: a logarithm resolves both.
         change = torch.asinh((step - step[:, -1:]) * (real / self.config.change_scale))
         return torch.cat([step, change, real.to(step.dtype)], dim=-1) * self.step_feature_scale
 
     def _present_features(self, now: Tensor, step: Tensor, known: Tensor | None) -> Tensor:
-        """Newest position and step, ``(R, 3)`` each, when and where they lead to a cushion, and what is ``known``."""
+        """Newest position and step, ``(R, 3)`` each, when and where they reach a cushion, and ``known``."""
         features, extent, horizon = [now, step], self.config.half_extent, self.config.horizon
         if extent is not None:
             place, speed = now[:, :2], step[:, :2]
@@ -241,14 +240,14 @@ class Forecaster(Pretrained, Precise, DescribedForecast):
 
 
 def keys_of(config: ForecasterConfig) -> tuple[str, ...]:
-    """Entries of the observation that a forecaster of ``config`` reads."""
+    """Keys of the observation that a forecaster of ``config`` reads."""
     return (keys.TARGET_HISTORY, keys.TARGET_COVARIANCE) if config.tracked else (keys.TARGET_HISTORY,)
 
 
 def check_covariance(covariance: Tensor | None, history: Tensor, **about: Any) -> Tensor:
-    """The covariance (*B, 2, 2) beside histories (*B, H, D), as `network_input` takes it; raises `InputError`."""
+    """The covariance (*B, 2, 2) of histories (*B, H, D), as `network_input` takes it; raises `InputError`."""
     if covariance is None:
-        raise InputError("a tracked forecaster reads target_covariance (*B, 2, 2) beside the history, got none")
+        raise InputError("a tracked forecaster reads target_covariance (*B, 2, 2) in addition to the history, got none")
     if covariance.shape[:-2] != history.shape[:-2]:
         check_trailing_shape(keys.TARGET_COVARIANCE, covariance, *history.shape[:-2], 2, 2)
     return network_input(keys.TARGET_COVARIANCE, covariance, 2, 2, **about)
@@ -257,7 +256,7 @@ def check_covariance(covariance: Tensor | None, history: Tensor, **about: Any) -
 def how_well_known(covariance: Tensor) -> Tensor:
     """Features ``(R, 3)`` of covariances (R, 2, 2) of position and velocity.
 
-    They are the logarithms of both standard deviations, in units of 1 mm and 0.1 m/s, and the correlation.
+    These are the logarithms of both standard deviations, in units of 1 mm and 0.1 m/s, and the correlation.
     """
     place, both, speed = covariance[:, 0, 0], covariance[:, 0, 1], covariance[:, 1, 1]
     place, speed = place + LEAST_VARIANCE, speed + LEAST_VARIANCE
@@ -266,15 +265,15 @@ def how_well_known(covariance: Tensor) -> Tensor:
 
 
 LEAST_SAMPLES = 2
-"""A target that a track has seen so often has a velocity."""
+"""Number of measurements after which a track has a velocity."""
 LEAST_VARIANCE = 1e-10
 """Added to variances before their logarithm is taken [m², m²/s²]."""
 
 
 def convolve(features: Tensor, layer: Any) -> Tensor:
-    """What ``layer`` makes of ``features`` (R, L, C), as a matrix product: faster for few rows and channels.
+    """``layer`` applied to ``features`` (R, L, C) as a matrix product, which is faster for few rows and channels.
 
-    Steps are repeated at the old end, where they are too few for the last window to end with the newest one.
+    The oldest step is repeated if needed so that the last window ends with the newest step.
     """
     size, stride = layer.kernel_size[0], layer.stride[0]
     if size == 1:

@@ -1,7 +1,7 @@
-"""Networks for inference: the same functions in fewer operations, with scales and layouts put into the weights.
+"""Networks for inference: the same functions in fewer operations, with scales and layouts folded into the weights.
 
-At one row a network costs what its operations cost to launch, hardly what they compute. Space and time are in the same
-products as everything else: these networks are in float32 or float64, even those of networks in half precision.
+For one row, a network's cost is the launch of its operations, not their arithmetic. Positions and times are part of the
+same products as everything else, so these networks are in float32 or float64, even for networks in half precision.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ if TYPE_CHECKING:
     from torchdyn_plan.nets.spread import SpreadNetwork
 
 DENSE = 2**14
-"""A convolution of at most so many weights, written out as one matrix over all steps, is cheaper as that matrix."""
+"""A convolution is written out as one matrix over all steps if that matrix has at most this many weights."""
 
 
 def hold_constants(module: nn.Module, dtype: torch.dtype, **constants: Tensor) -> None:
@@ -39,7 +39,7 @@ def hold_constants(module: nn.Module, dtype: torch.dtype, **constants: Tensor) -
 
 
 class Prepared:
-    """Copies of models for inference, and the weights of which they were made."""
+    """Copies of models for inference, and the weights they were made from."""
 
     def __init__(self, models: Sequence[nn.Module], copies: Sequence[Any]) -> None:
         """Hold ``copies`` of ``models``, made just now."""
@@ -48,7 +48,7 @@ class Prepared:
 
     @classmethod
     def of(cls, *models: Any) -> Self | None:
-        """Copies of ``models``; None where there is nothing to gain, or their weights may change unseen."""
+        """Copies of ``models``; None if nothing is gained, or if their weights may change unnoticed."""
         weights = [value for _, _, value in _weights_of(models)]
         if any(value.requires_grad or value.is_inference() or _is_shared(value) for value in weights):
             return None
@@ -56,10 +56,10 @@ class Prepared:
         return None if all(map(operator.is_, copies, models)) else cls(models, copies)
 
     def stands_for(self, *inputs: Tensor) -> bool:
-        """Whether the copies may be asked about ``inputs`` in place of the models.
+        """Whether the copies may be used for ``inputs`` instead of the models.
 
-        Not where weights are others by now, or some derivative may be asked for; nor while compiling, whose graph holds
-        the weights themselves, nor under ``torch.func``, which may exchange them.
+        They may not if weights have changed or a gradient may be needed, while compiling (the graph holds the weights
+        themselves), or under ``torch.func`` (which may replace them).
         """
         if torch.compiler.is_compiling() or any(debug_unwrap(value) is not value for value in inputs):
             return False
@@ -72,21 +72,21 @@ class Prepared:
 
 
 def _weights_of(models: Iterable[nn.Module]) -> list[tuple[dict[str, Any], str, Tensor]]:
-    """Every parameter and buffer of ``models``: the table that holds it, and its name there."""
+    """Every parameter and buffer of ``models``: the dictionary that holds it, and its name there."""
     tables = [table for model in models for part in model.modules() for table in (part._parameters, part._buffers)]
     return [(table, name, value) for table in tables for name, value in table.items() if value is not None]
 
 
 def _is_shared(value: Tensor) -> bool:
-    """Whether other processes may change ``value``; memory of other devices calls itself shared always."""
+    """Whether other processes may change ``value``; tensors on other devices always report themselves as shared."""
     return value.device.type == "cpu" and value.is_shared()
 
 
 class InferenceForecaster(Precise, DescribedForecast):
-    """`Forecaster` for inference; forecasts differ by rounding alone.
+    """`Forecaster` for inference; forecasts differ by rounding only.
 
-    The one exception: with square symmetry, a target that stands still within a millimetre of a cushion is taken to
-    be on its way to that cushion.
+    One exception: with square symmetry, a target at rest within a millimetre of a cushion is treated as moving towards
+    that cushion.
     """
 
     zero: Tensor
@@ -110,7 +110,7 @@ class InferenceForecaster(Precise, DescribedForecast):
     spread_head_bias: Tensor
 
     def __init__(self, network: Forecaster, spread: SpreadNetwork | None = None) -> None:
-        """Take the weights of ``network``, and of the ``spread`` that judges it, as they are now."""
+        """Copy the current weights of ``network``, and of its ``spread``."""
         super().__init__()
         self.config = config = network.config
         self.history, self.in_keys, self.samples = config.history, network.in_keys, network.samples
@@ -140,14 +140,14 @@ class InferenceForecaster(Precise, DescribedForecast):
                 hold_constants(self, dtype, **constants)
 
     def forward(self, target_history: Tensor, target_covariance: Tensor | None = None) -> Tensor:
-        """Positions at the next F control steps, ``(*B, F, 3)`` [m, world], as `Forecaster.forward` describes."""
+        """Positions at the next F control steps, ``(*B, F, 3)`` [m, world], see `Forecaster.forward`."""
         self._check(target_history, target_covariance)
         return self._forecast(target_history, target_covariance)[0]
 
     def describe(
         self, target_history: Tensor, target_covariance: Tensor | None = None
     ) -> tuple[Tensor, Tensor, Tensor]:
-        """The same forecast, and what a spread is told by, as `Forecaster.describe` describes."""
+        """The same forecast, and the features for a spread, see `Forecaster.describe`."""
         self._check(target_history, target_covariance)
         forecast, hidden, turn = self._forecast(target_history, target_covariance)
         batch = target_history.shape[:-2]
@@ -166,7 +166,7 @@ class InferenceForecaster(Precise, DescribedForecast):
     def _forecast(
         self, target_history: Tensor, target_covariance: Tensor | None = None
     ) -> tuple[Tensor, Tensor, Tensor]:
-        """Positions (*B, F, 3), hidden features (R, hidden) and how each row was turned (R, 3, 7)."""
+        """Positions (*B, F, 3), hidden features (R, hidden) and the symmetry applied to each row (R, 3, 7)."""
         config, like = self.config, self.head_weight
         if autocast_is_on():
             return without_autocast(self._forecast, target_history, target_covariance)
@@ -177,7 +177,7 @@ class InferenceForecaster(Precise, DescribedForecast):
             seen = network_input("target_history", seen, config.history, 3, like=like, finite=False)
         history = seen.reshape(-1, config.history, 3)
         if config.square_symmetry:
-            # The nearest of the eight octants' middles says how a row is turned, and its line turned back and shifted.
+            # The nearest of the eight octants' middles selects a row's symmetry, its inverse, and the line's shift.
             now = history[:, -1]
             direction = (now - history[:, -2]).add_(now, alpha=1e-6)
             turn = self.turns.index_select(0, direction.mm(self.octants).argmax(dim=-1))
@@ -197,9 +197,9 @@ class InferenceForecaster(Precise, DescribedForecast):
         return path if seen is target_history else path.to(target_history.dtype), hidden, turn
 
     def predict(self, *seen: Tensor) -> Forecast:
-        """The path, and its spread if there is a network that judges it.
+        """The path, and its spread if there is a spread network.
 
-        Whoever asks, as a planner, has looked for what is no number: nothing of its row is.
+        The caller, such as a planner, must have checked for NaN.
         """
         path, hidden, turn = self._forecast(*seen)
         if not self.judged:
@@ -208,7 +208,7 @@ class InferenceForecaster(Precise, DescribedForecast):
         return Forecast(path, spread if path.dtype == hidden.dtype else Spread(*in_type_of(path, *spread)))
 
     def _spread(self, hidden: Tensor, turn: Tensor, batch: torch.Size) -> Spread:
-        """What `SpreadNetwork.forward` makes of features (R, hidden) of rows that were turned (R, 3, 7)."""
+        """`SpreadNetwork.forward` of features (R, hidden) of rows with symmetry ``turn`` (R, 3, 7)."""
         if autocast_is_on():
             return without_autocast(self._spread, hidden, turn, batch)
         features = torch.addmm(self.spread_hidden_bias, hidden, self.spread_hidden_weight).relu_()
@@ -225,7 +225,7 @@ class InferenceForecaster(Precise, DescribedForecast):
         return Spread(scale, shape, gone.view(*batch, horizon))
 
     def _known(self, target_covariance: Tensor) -> Tensor:
-        """Inputs ``(R, 3)`` for how well position and velocity are known, by their covariance (*B, 2, 2)."""
+        """Inputs ``(R, 3)`` from the covariance (*B, 2, 2) of position and velocity."""
         from torchdyn_plan.nets.forecaster import how_well_known
 
         return how_well_known(target_covariance.to(self.head_weight).reshape(-1, 2, 2))
@@ -254,7 +254,7 @@ class InferenceForecaster(Precise, DescribedForecast):
         return line, hidden
 
     def _ahead(self, now: Tensor, newest: Tensor) -> tuple[Tensor, ...]:
-        """When and where the newest position and step, ``(R, 3)`` each, lead to a cushion, ``(R, 2)`` each."""
+        """When and where the newest position and step, ``(R, 3)`` each, reach a cushion, ``(R, 2)`` each."""
         extent, most = self.config.half_extent, 2.0 * self.config.horizon
         if extent is None:
             return ()
@@ -269,7 +269,7 @@ class InferenceForecaster(Precise, DescribedForecast):
 
 
 class InferenceETA(Precise, ArrivalModel):
-    """`ETANetwork` for inference; scores differ by rounding alone."""
+    """`ETANetwork` for inference; scores differ by rounding only."""
 
     state_weight: Tensor
     state_bias: Tensor
@@ -284,7 +284,7 @@ class InferenceETA(Precise, ArrivalModel):
     moments: Tensor
 
     def __init__(self, network: ETANetwork) -> None:
-        """Take the weights of ``network`` as they are now."""
+        """Copy the current weights of ``network``."""
         super().__init__()
         self.config = config = network.config
         dtype, exact, size = network.head.weight.dtype, copy.deepcopy(network).double(), config.coordinates
@@ -303,21 +303,21 @@ class InferenceETA(Precise, ArrivalModel):
         )
 
     def forward(self, robot_state: Tensor, goal: Tensor) -> Tensor:
-        """Scores of the bins, ``(*B, bins + 1)``, as `ETANetwork.forward` describes."""
+        """Scores of the bins, ``(*B, bins + 1)``, see `ETANetwork.forward`."""
         if autocast_is_on():
             return without_autocast(self.forward, robot_state, goal)
         self._check(robot_state, goal)
         return self.scores(*self._share(robot_state), goal).to(goal.dtype)
 
     def arrival(self, robot_state: Tensor, goal: Tensor, *, estimator: str = "mode") -> Arrival:
-        """Arrival time at ``goal (*B, 3)`` from ``robot_state (*B, S)``, as `ETANetwork.arrival` describes."""
+        """Arrival time at ``goal (*B, 3)`` from ``robot_state (*B, S)``, see `ETANetwork.arrival`."""
         self._check(robot_state, goal)
         return self.read(*self._share(robot_state), goal, estimator=estimator)
 
     def from_state(self, robot_state: Tensor) -> ArrivalQuery:
-        """Arrivals from ``robot_state`` (*B, S) at goals (*B, K, 3): the state's part of the work is done once.
+        """Arrivals from ``robot_state`` (*B, S) at goals (*B, K, 3); work that depends on the state is done once.
 
-        Whoever asks, as a planner, has looked for what is no number; goals are a search's own.
+        The caller, such as a planner, must have checked for NaN; the goals come from its search.
         """
         return partial(self.read, *self._share(robot_state.unsqueeze(-2)))
 
@@ -327,7 +327,7 @@ class InferenceETA(Precise, ArrivalModel):
         network_input("robot_state", robot_state, self.config.robot_state_size, like=self.head_weight)
 
     def _share(self, robot_state: Tensor) -> tuple[Tensor, Tensor]:
-        """The tool's place in states (*B, S), and their share of the first layer, ``(*B, hidden)``."""
+        """The tool position in states (*B, S), and their share of the first layer, ``(*B, hidden)``."""
         weight, size, seen = self.state_weight, self.config.robot_state_size, robot_state
         if autocast_is_on():
             return without_autocast(self._share, robot_state)
@@ -362,7 +362,7 @@ class InferenceETA(Precise, ArrivalModel):
 
 
 def _turns(network: Forecaster) -> Tensor:
-    """For each symmetry (8, 3, 7): the turn of the history, the turn back of the line's units, and their shift."""
+    """For each symmetry (8, 3, 7): its matrix for the history, the inverse in the line's units, and their shift."""
     turn, extent = network.symmetries.double(), network.config.half_extent
     unit, shift = turn.new_ones(3), turn.new_zeros(3)
     if extent is not None:
@@ -371,7 +371,7 @@ def _turns(network: Forecaster) -> Tensor:
 
 
 def _octants(network: Forecaster) -> Tensor:
-    """Middles (3, 8) of the octants that the symmetries turn into the first: the nearest one of a direction is its."""
+    """Middles (3, 8) of the octants that the symmetries map to the first; a direction belongs to the nearest one."""
     middle = torch.tensor([0.9238795325112867, 0.3826834323650898, 0.0], dtype=torch.float64)
     return (network.symmetries.double() @ middle).mT
 

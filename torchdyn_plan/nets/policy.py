@@ -1,4 +1,4 @@
-"""A goal-conditioned policy and its critic: robot state and goal to an action, and to what that action is worth."""
+"""A goal-conditioned policy and its critic."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ class PolicyConfig:
     layers: int = 3
     """Number of hidden layers."""
     near: float = 0.05
-    """Distance from the goal within which offsets are told apart finely [m]."""
+    """Distance from the goal within which offsets are resolved finely [m]."""
 
     def __post_init__(self) -> None:
         for name in ("robot_state_size", "action_size", "hidden", "layers"):
@@ -50,13 +50,13 @@ class PolicyConfig:
 
 
 class GoalFeatures(Precise):
-    """What actor and critic see of a robot state and a goal: standardised by buffers, all of about unit size."""
+    """Input features of actor and critic from robot state and goal, standardised by buffers to about unit size."""
 
     shift: Tensor
     scale: Tensor
 
     def __init__(self, config: PolicyConfig) -> None:
-        """Buffers that leave inputs as they are, until `set_statistics` fills them."""
+        """Buffers that leave inputs unchanged until `set_statistics` fills them."""
         super().__init__()
         self.tool, self.size = slice(*config.tool_slice), config.robot_state_size + GOAL_FEATURES
         self.sharpness = 1.0 / config.near
@@ -95,7 +95,7 @@ class Actor(Pretrained, nn.Module):
         self.config = config = config or PolicyConfig(**settings)
         self.features = GoalFeatures(config)
         self.body = _perceptron(self.features.size, config, config.action_size, normalised=False)
-        # Small first actions: a tanh that starts saturated hardly learns.
+        # Small initial actions: a saturated tanh hardly learns.
         final = self.body[-1]
         assert isinstance(final, nn.Linear)
         nn.init.uniform_(final.weight, -3e-3, 3e-3)
@@ -106,7 +106,7 @@ class Actor(Pretrained, nn.Module):
 
         Args:
             robot_state: ``(*B, S)``.
-            goal: ``(*B, 3)`` place to reach [m, world].
+            goal: ``(*B, 3)`` [m, world].
 
         Returns:
             ``(*B, A)`` within ±1.
@@ -120,7 +120,7 @@ class Actor(Pretrained, nn.Module):
         about: Any = {"like": features.scale, "owner": type(self).__name__, "finite": False}
         seen = network_input("robot_state", robot_state, self.config.robot_state_size, **about)
         hidden = features(seen, network_input("goal", goal, 3, **about))
-        # Looked at once, where both have come together.
+        # One check, after both are combined.
         if not torch.compiler.is_compiling() and not math.isfinite(debug_unwrap(hidden).sum().item()):
             check_finite("robot_state", robot_state)
             check_finite("goal", goal)
@@ -132,7 +132,7 @@ class Actor(Pretrained, nn.Module):
 
 
 class Critic(nn.Module):
-    """Action value Q(s, g, a): fully connected, layer-normalised so that it cannot run away, with ReLU."""
+    """Action value Q(s, g, a): fully connected with ReLU, layer-normalised so that it cannot diverge."""
 
     def __init__(self, config: PolicyConfig) -> None:
         """Build the network from ``config``."""

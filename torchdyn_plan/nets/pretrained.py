@@ -16,14 +16,14 @@ from torchdyn_plan.schemas import check_settings
 
 FORMAT = "torchdyn_plan.network.1"
 SHIPPED = Path(__file__).parent.parent / "weights"
-"""Folder of the networks that come with the package: ``kind-name.safetensors``."""
+"""Folder of the networks shipped with the package: ``kind-name.safetensors``."""
 
 
 class Pretrained:
     """Adds `save_pretrained` and `from_pretrained` to an `nn.Module` built from one configuration dataclass."""
 
     kind: ClassVar[str]
-    """What its files are called before the name."""
+    """Prefix of its file names."""
     config_type: ClassVar[Callable[..., Any]]
     config: Any
 
@@ -57,11 +57,11 @@ class Pretrained:
 
     @classmethod
     def from_pretrained(cls, name_or_path: str | Path, *, device: torch.device | str | None = None) -> Self:
-        """Network of this class from a name that ships, a file, or a folder of `save_pretrained` or of a training.
+        """Network of this class from a shipped name, a file, or a folder written by `save_pretrained` or a training.
 
         Raises:
-            WeightsError: no such name or file; or a file that is truncated, holds another network, or weights that are
-                no finite float32 numbers. Nothing is allocated before the file's header has been found to fit.
+            WeightsError: there is no such name or file, or the file is truncated, holds another network, or weights
+                that are not finite float32 numbers. The file's header is checked before anything is allocated.
         """
         file = cls.find(name_or_path)
         build: Any = cls
@@ -79,7 +79,7 @@ class Pretrained:
 
     @classmethod
     def _read_config(cls, file: Path, metadata: Mapping[str, str]) -> Any:
-        """Configuration in the file's ``metadata``; raises `WeightsError` where it is none of this network."""
+        """Configuration in the file's ``metadata``; raises `WeightsError` if it is not one of this network."""
         if metadata.get("format") != FORMAT or metadata.get("class") != cls.__name__:
             found = metadata.get("class") or "no network of this package"
             raise WeightsError(f"{short_path(file)} holds {found}, expected {cls.__name__}")
@@ -91,7 +91,7 @@ class Pretrained:
 
     @classmethod
     def _expected(cls, file: Path, config: Any) -> dict[str, Tensor]:
-        """Tensors of the network with this configuration, on no device: they take no memory."""
+        """Tensors of the network with this configuration, on the meta device: they take no memory."""
         build: Any = cls
         try:
             with torch.device("meta"):
@@ -120,12 +120,12 @@ class Pretrained:
 
 
 def _as_kept(tensor: Tensor) -> Tensor:
-    """``tensor`` as files hold it."""
+    """``tensor`` as it is stored in files."""
     return tensor.detach().float() if tensor.is_floating_point() else tensor.detach()
 
 
 def _check_header(file: Path, expected: Mapping[str, Tensor], found: Mapping[str, Any]) -> None:
-    """Raise `WeightsError` unless the tensors that are ``found`` in the header have the expected names and kinds."""
+    """Raise `WeightsError` unless the tensors ``found`` in the header have the expected names, shapes and types."""
     for name in sorted(expected.keys() | found.keys()):
         if name not in found:
             raise WeightsError(f"{short_path(file)} lacks the tensor {name!r}")
@@ -141,4 +141,4 @@ def _check_header(file: Path, expected: Mapping[str, Tensor], found: Mapping[str
 
 
 _KINDS = {torch.float32: "F32", torch.int64: "I64", torch.int32: "I32", torch.bool: "BOOL"}
-"""How files call the types of tensors."""
+"""Names of tensor types in files."""

@@ -5,14 +5,14 @@ from torch import Tensor
 
 
 def reflect(line: Tensor, half_extent: float) -> Tensor:
-    """Coordinates on the table of a path that runs on through the cushions: the triangle wave of period 4L.
+    """Reflect a path that runs on through the cushions back onto the table: a triangle wave of period 4L.
 
     Args:
         line: ``(*B,)`` coordinates along one axis, any value [m].
         half_extent: L, where the path is mirrored: at -L and L [m].
 
     Returns:
-        ``(*B,)`` coordinates within [-L, L] [m]; an odd function (but for rounding) whose slope is 1 or -1.
+        ``(*B,)`` coordinates within [-L, L] [m]; an odd function (up to rounding) with slope 1 or -1.
     """
     period = 4 * half_extent
     return half_extent - (torch.remainder(line + half_extent, period) - period / 2).abs()

@@ -1,4 +1,4 @@
-"""How far a forecast may be off: the distribution of its error at each future step, from what the forecaster saw."""
+"""Distribution of a forecast's error at each future step, predicted from the forecaster's features."""
 
 from dataclasses import dataclass
 from typing import Any
@@ -22,15 +22,15 @@ class SpreadConfig:
     features: int = 384
     """Width of the forecaster's hidden layer."""
     horizon: int = 300
-    """Steps F that it judges, as many as the forecaster emits."""
+    """Steps F, as many as the forecaster emits."""
     hidden: int = 128
     """Width of the layer between features and head."""
     rank: int = 24
     """Rank of the head."""
     finest: float = 1e-5
-    """Errors are not told apart below this [m]; it is added to every error before its logarithm is taken."""
+    """Added to every error before its logarithm is taken, so that smaller errors are not distinguished [m]."""
     tracked: bool = False
-    """Whether the forecaster that it judges is."""
+    """Whether its forecaster is ``tracked``."""
 
     def __post_init__(self) -> None:
         for name in ("features", "horizon", "hidden", "rank"):
@@ -39,7 +39,7 @@ class SpreadConfig:
 
 
 class SpreadNetwork(Pretrained, nn.Module):
-    """Adds a spread to a `Forecaster`, whose own positions it does not touch.
+    """Adds a spread to a `Forecaster`; the forecast positions do not change.
 
     One hidden layer and a linear head of low rank on the forecaster's last hidden layer.
     """
@@ -62,11 +62,11 @@ class SpreadNetwork(Pretrained, nn.Module):
             bias[2:] = torch.tensor([0.0, 0.0, -4.0]).unsqueeze(-1)
 
     def forward(self, features: Tensor, swapped: Tensor) -> Spread:
-        """Spread of the forecasts that `Forecaster.describe` describes, of their type, in float32 at least.
+        """Spread of the forecasts, from the outputs of `Forecaster.describe`; of their type, in float32 at least.
 
         Args:
             features: ``(*B, features)``.
-            swapped: ``(*B,)`` bool: x and y are exchanged.
+            swapped: ``(*B,)`` bool: x and y are swapped.
 
         Raises:
             InputError: a shape or a device is wrong.
@@ -75,7 +75,7 @@ class SpreadNetwork(Pretrained, nn.Module):
         return Spread(log_scale.exp(), log_shape.exp(), gone.sigmoid())
 
     def raw(self, features: Tensor, swapped: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-        """Logarithms of scale and shape (*B, F, 2) and the logit of being gone (*B, F): what training compares."""
+        """Logarithms of scale and shape (*B, F, 2) and the logit of ``gone`` (*B, F), as used by the training loss."""
         weight = self.head.weight
         if autocast_is_on():
             return without_autocast(self.raw, features, swapped)
@@ -92,10 +92,10 @@ class SpreadNetwork(Pretrained, nn.Module):
 
 
 class SpreadForecaster(ForecastModel):
-    """A forecaster that also says how far it may be off."""
+    """A forecaster with the spread of its error."""
 
     def __init__(self, forecaster: DescribedForecast, spread: SpreadNetwork) -> None:
-        """Judge the paths of ``forecaster`` by ``spread``, which was fitted to its errors."""
+        """Combine ``forecaster`` with ``spread``, which was fitted to its errors."""
         super().__init__()
         if not isinstance(spread, SpreadNetwork):
             raise InputError(f"spread is {type(spread).__name__}, expected a SpreadNetwork")
@@ -108,7 +108,7 @@ class SpreadForecaster(ForecastModel):
         return Forecast(path, self.spread(features, swapped))
 
     def for_inference(self) -> ForecastModel:
-        """A copy of the weights as they are now, in fewer operations; it does not follow later training."""
+        """A copy for inference with the current weights, in fewer operations; it does not follow later training."""
         from torchdyn_plan.nets.inference import InferenceForecaster
 
         if not isinstance(self.forecaster, Forecaster):

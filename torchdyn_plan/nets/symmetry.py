@@ -1,4 +1,4 @@
-"""The eight symmetries of a square table, as rotation-reflection matrices that bring any motion into one octant."""
+"""The eight symmetries of a square table, as matrices that map any motion into one octant."""
 
 import torch
 from torch import Tensor
@@ -12,7 +12,7 @@ def square_symmetries() -> Tensor:
 
 
 def octant(direction: Tensor) -> Tensor:
-    """Which of the eight symmetries brings ``direction`` into the octant x ≥ y ≥ 0.
+    """Which of the eight symmetries maps ``direction`` into the octant x ≥ y ≥ 0.
 
     Args:
         direction: ``(*B, 2)``; rows are multiplied by the symmetry from the right: ``direction @ symmetry``.

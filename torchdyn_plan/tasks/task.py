@@ -26,7 +26,7 @@ if TYPE_CHECKING:
     from torchdyn_plan.evaluation.curves import PaperMoments, PaperPanel
 
 NOISY = "noisy_"
-"""Begin of the names of networks for targets that are measured with noise, and seen by a track."""
+"""Name prefix of networks for noisy measurements, seen through a track."""
 NEAREST_ETA = "nearest_eta"
 """Network of the times until the robot is as near to a goal as it can come, and the end of its weights' name."""
 ENTRY_POINTS = "torchdyn_plan.tasks"
@@ -307,7 +307,7 @@ class PlannerParts:
 
     @property
     def forecaster_by_noise(self) -> Any:
-        """`spread_forecaster`, and beside it the one for targets that are measured with noise, where there is one."""
+        """`spread_forecaster`, together with the one for noisy measurements if there is one."""
         from torchdyn_plan.nets import ForecastByNoise, Forecaster, SpreadForecaster, SpreadNetwork
 
         if self.weights is None:

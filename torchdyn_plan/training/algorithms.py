@@ -1,4 +1,4 @@
-"""Ways to train a policy by trial, by name. Nothing heavy is imported here: help answers at once."""
+"""Reinforcement learning algorithms by name. Imports nothing heavy, so that ``--help`` is fast."""
 
 from __future__ import annotations
 
@@ -12,16 +12,16 @@ ALGORITHMS = {
     "ddpg": ("torchdyn_plan.training.ddpg:DDPG", "torchdyn_plan.training.goal_task:DDPGRecipe"),
     "averaged": ("torchdyn_plan.training.averaged:AveragedDDPG", "torchdyn_plan.training.averaged:AveragedRecipe"),
 }
-"""Where what learns, and its recipe, are defined. The first one is the paper's."""
+"""Where each algorithm and its recipe are defined. The first one is the paper's."""
 
 
 def learner_type(name: str) -> Any:
-    """What learns by algorithm ``name``: `DDPG`, or a subclass of it."""
+    """The class of algorithm ``name``: `DDPG`, or a subclass of it."""
     return _load(ALGORITHMS[name][0])
 
 
 def recipe_for(name: str, recipe: DDPGRecipe) -> DDPGRecipe:
-    """``recipe``, if it is one of algorithm ``name``; else what stands for it there.
+    """``recipe`` if it belongs to algorithm ``name``, otherwise its equivalent for that algorithm.
 
     Raises:
         InputError: there is no such algorithm.

@@ -1,4 +1,4 @@
-"""Recorded arrivals of a static planner: from which state to which goal in how many steps."""
+"""Recorded arrivals of a static planner: states, goals and the steps between them."""
 
 from pathlib import Path
 from typing import NamedTuple
@@ -15,15 +15,15 @@ class Arrivals(NamedTuple):
     """Samples of runs of a static planner."""
 
     robot_state: Tensor
-    """(n, S), as the ETA network reads it."""
+    """(n, S), the input of the ETA network."""
     goal: Tensor
     """(n, 3) [m, world]."""
     arrival: Tensor
     """(n,) int64 control steps until the goal was reached, -1 for never."""
     nearest: Tensor
-    """(n,) int64 control steps until the tool was as near to the goal as it came."""
+    """(n,) int64 control steps until the tool was nearest to the goal."""
     run: Tensor
-    """(n,) int64: samples with one number come from one run."""
+    """(n,) int64: samples with the same number come from the same run."""
 
     def take(self, rows: Tensor) -> "Arrivals":
         """The samples ``rows`` (M,)."""
@@ -31,10 +31,10 @@ class Arrivals(NamedTuple):
 
 
 def load_arrivals(folder: Path, *, state_size: int | None = None) -> Arrivals:
-    """Every ``arrivals-*.safetensors`` of ``folder`` as one.
+    """All ``arrivals-*.safetensors`` of ``folder``, concatenated.
 
     Raises:
-        InputError: there is none, one is broken, or robot states have not ``state_size`` entries, if that is given.
+        InputError: there is none, one is broken, or robot states do not have ``state_size`` entries, if given.
     """
     shards = read_shards(folder, "arrivals", Arrivals._fields)
     data = Arrivals(*(torch.cat([shard[name] for shard in shards]) for name in Arrivals._fields))
@@ -54,12 +54,12 @@ def load_arrivals(folder: Path, *, state_size: int | None = None) -> Arrivals:
 
 
 def split_groups(group: Tensor, seed: int, *, share: float = 0.1) -> tuple[Tensor, Tensor]:
-    """Rows to train on and rows to hold out, whole groups apart: int64 indices of ``group``, ascending.
+    """Training and held-out rows, split by whole groups: int64 indices of ``group``, ascending.
 
     Args:
-        group: ``(n,)`` int64: rows with one number stay together.
-        seed: which groups are held out.
-        share: of the groups that are held out, at least one.
+        group: ``(n,)`` int64: rows with the same number stay together.
+        seed: selects the held-out groups.
+        share: share of held-out groups, at least one group.
     """
     names, member = group.unique(return_inverse=True)
     if len(names) < 2:

@@ -1,4 +1,4 @@
-"""DDPG with hindsight, made to learn in less time: what came after it where that pays, and a lean update."""
+"""Faster DDPG with hindsight replay: delayed actor updates, an averaged actor, and a lean update step."""
 
 from __future__ import annotations
 
@@ -21,18 +21,18 @@ from torchdyn_plan.training.goal_task import SEEN, DDPGRecipe
 
 @dataclass(frozen=True, kw_only=True)
 class AveragedRecipe(DDPGRecipe):
-    """How a policy is trained by `AveragedDDPG`; other fields are as in `DDPGRecipe`."""
+    """Recipe of `AveragedDDPG`; for the other fields see `DDPGRecipe`."""
 
     iterations: int = 100
     """Rounds of collection and updates."""
     gamma: float = 0.95
-    """Discount of an action; values are learned the sooner the smaller it is."""
+    """Discount per action; smaller values are learned sooner."""
     tau: float = 0.05
-    """Share of the networks that their targets take over at each update."""
+    """Soft-update rate of the target networks."""
     delay: int = 2
-    """Updates of the critic for one of the actor."""
+    """Critic updates per actor update."""
     average: float = 0.005
-    """Share of the actor that its average takes over at each update."""
+    """Soft-update rate of the averaged actor."""
 
     algorithm: ClassVar[str] = "averaged"
 
@@ -43,11 +43,11 @@ class AveragedRecipe(DDPGRecipe):
 
 
 class AveragedDDPG(DDPG):
-    """DDPG whose actor learns at every second update, as TD3's, and whose policy is a running average of its actors.
+    """DDPG with an actor update at every second step, as in TD3, and a running average of the actors as its policy.
 
-    The actor itself swings from update to update while the critic is far from settled, between policies that trap
-    nearly all balls and policies that sweep them aside; its average does not. The critic is `DDPG`'s, one alone: with
-    its layers normalised, the lesser of two learned slower, and quantiles did, too.
+    Before the critic has converged, the actor itself alternates between policies that trap nearly all balls and
+    policies that sweep them aside; its average does not. There is one critic, as in `DDPG`: with normalised layers, the
+    minimum of two critics learned more slowly, and so did quantiles.
     """
 
     recipe: AveragedRecipe
@@ -69,14 +69,14 @@ class AveragedDDPG(DDPG):
         return self.average
 
     def standardise(self) -> None:
-        """Set the inputs' statistics of all networks by what is in the replay buffer."""
+        """Set the input statistics of all networks from the replay buffer."""
         seen = self.replay.tensors()
         self.actor.features.set_statistics(seen[keys.OBSERVATION], seen[keys.DESIRED_GOAL])
         for network in (self.critic, self.target_actor, self.target_critic, self.average):
             network.features.load_state_dict(self.actor.features.state_dict())
 
     def improve(self) -> dict[str, float]:
-        """As `DDPG`'s."""
+        """See `DDPG`."""
         with quick_products():
             return super().improve()
 
@@ -100,7 +100,7 @@ class AveragedDDPG(DDPG):
 
     @torch.no_grad()
     def value_targets(self, batch: TensorDictBase) -> Tensor:
-        """What the critic should say of ``batch`` (B,), ``(B, 1)``: one step's reward and the targets' view after."""
+        """Critic targets of ``batch`` (B,), ``(B, 1)``: one step's reward plus the target networks' value."""
         after: TensorDictBase = batch.get("next")
         state, goal = (after.get(key) for key in SEEN)
         value = self.target_critic(state, goal, self.target_actor(state, goal))
@@ -109,7 +109,7 @@ class AveragedDDPG(DDPG):
 
     @torch.no_grad()
     def follow(self) -> None:
-        """Let targets and average take over their shares of the networks."""
+        """Soft updates of the target networks and of the averaged actor."""
         lerp: Any = torch._foreach_lerp_  # pyright: ignore[reportPrivateImportUsage]
         for follower, leader, share in (
             (self.target_actor, self.actor, self.recipe.tau),

@@ -1,4 +1,4 @@
-"""The card beside a network: what it was made with and how well it does."""
+"""The model card of a network: how it was made and how well it performs."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ if TYPE_CHECKING:
 
 Rows = list[dict[str, Any]]
 Tables = dict[str, Rows]
-"""Rows of figures by caption."""
+"""Tables of figures by caption."""
 
 
 def write_network(
@@ -35,7 +35,7 @@ def write_network(
 ) -> Path:
     """Write a fitted network, its scores as ``scores.json`` and its card into ``folder``; returns the weights' file.
 
-    ``network_name`` is what the command line calls the network; its kind for None.
+    ``network_name`` is the network's name on the command line; its kind for None.
     """
     network.eval()
     with torch.no_grad():

@@ -1,4 +1,4 @@
-"""Where a fit stands, in one file: tensors in safetensors, scalars and settings as JSON in its metadata."""
+"""Checkpoint of a fit in one file: tensors in safetensors, scalars and settings as JSON in its metadata."""
 
 import hashlib
 import json
@@ -25,7 +25,7 @@ class About(TypedDict):
     progress: str
     """JSON."""
     digest: str
-    """Of all the rest: a file that was damaged does not have it."""
+    """Digest of all the rest, to detect damage."""
 
 
 def save_checkpoint(
@@ -37,14 +37,14 @@ def save_checkpoint(
     settings: dict[str, Any],
     progress: dict[str, Any],
 ) -> None:
-    """Write everything that the next step depends on to ``file``, whole or not at all.
+    """Write everything that the next step depends on to ``file``, atomically.
 
     Args:
         file: a ``.safetensors`` file.
-        network: its parameters and buffers are kept.
-        optimiser: its state for each parameter is kept.
-        generator: the CPU generator that every later draw comes from.
-        settings: what must be equal when the fit is resumed; JSON values.
+        network: its parameters and buffers are stored.
+        optimiser: its state for each parameter is stored.
+        generator: the CPU generator of all later draws.
+        settings: JSON values that must be equal when the fit is resumed.
         progress: JSON values that `load_checkpoint` returns.
     """
     tensors = {f"network.{name}": value for name, value in network.state_dict().items()}
@@ -56,7 +56,7 @@ def save_checkpoint(
 def write_checkpoint(
     file: Path, tensors: dict[str, Tensor], *, settings: dict[str, Any], progress: dict[str, Any]
 ) -> None:
-    """Write ``tensors``, JSON ``settings`` and JSON ``progress`` to ``file``, whole or not at all."""
+    """Write ``tensors``, JSON ``settings`` and JSON ``progress`` to ``file``, atomically."""
     tensors = {name: value.detach().cpu().contiguous() for name, value in tensors.items()}
     about = {"format": FORMAT, "settings": json.dumps(settings), "progress": json.dumps(progress)}
     write_tensors(file, tensors, about | {"digest": _digest(about, tensors)})
@@ -71,10 +71,10 @@ def load_checkpoint(
     settings: dict[str, Any],
     schema: Any = dict[str, Any],
 ) -> Any:
-    """Put network, optimiser and generator back where ``file`` has them; returns its progress, as ``schema`` says.
+    """Restore network, optimiser and generator from ``file``; returns its progress, checked by ``schema``.
 
     Raises:
-        TrainingError: the file is damaged, or was made with other ``settings``, of which the first is named.
+        TrainingError: the file is damaged, or was made with other ``settings``; the first difference is named.
     """
     tensors, progress = read_checkpoint(file, settings=settings, schema=schema)
     try:
@@ -93,18 +93,18 @@ def load_checkpoint(
 def read_checkpoint(
     file: Path, *, settings: dict[str, Any], schema: Any = dict[str, Any]
 ) -> tuple[dict[str, Tensor], Any]:
-    """Tensors in ``file``, and its progress, as ``schema`` says.
+    """Tensors in ``file``, and its progress, checked by ``schema``.
 
     Raises:
-        TrainingError: the file is damaged, or was made with other ``settings``, of which the first is named.
+        TrainingError: the file is damaged, or was made with other ``settings``; the first difference is named.
     """
     metadata, tensors = read_tensors(file, _DamagedError)
     if metadata.get("format") != FORMAT:
-        raise TrainingError(f"{short_path(file)} is no checkpoint of this package: {REMEDY}")
+        raise TrainingError(f"{short_path(file)} is not a checkpoint of this package: {REMEDY}")
     where = short_path(file)
     about: About = check_content(metadata, About, where, _DamagedError)
     if about["digest"] != _digest(metadata, tensors):
-        raise _DamagedError(f"{where} holds something else than was written")
+        raise _DamagedError(f"{where} differs from what was written")
     try:
         found, progress = parse_json(about["settings"]), parse_json(about["progress"])
     except ValueError as error:
@@ -117,7 +117,7 @@ REMEDY = "delete it or train without resume"
 
 
 class _DamagedError(TrainingError):
-    """A checkpoint cannot be gone on from."""
+    """A checkpoint cannot be resumed."""
 
     def __init__(self, text: str) -> None:
         super().__init__(f"damaged checkpoint: {text}: {REMEDY}")
@@ -134,7 +134,7 @@ def _digest(metadata: Mapping[str, str], tensors: Mapping[str, Tensor]) -> str:
 
 
 def group(tensors: dict[str, Tensor], prefix: str) -> dict[str, Tensor]:
-    """Those of ``tensors`` whose names begin with ``prefix`` and a dot, without them."""
+    """The ``tensors`` whose names begin with ``prefix`` and a dot, under the rest of their names."""
     return {name.removeprefix(f"{prefix}."): value for name, value in tensors.items() if name.startswith(f"{prefix}.")}
 
 

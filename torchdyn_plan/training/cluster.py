@@ -1,4 +1,4 @@
-"""The same training with its episodes run by workers of a Ray cluster."""
+"""Policy training with episodes run by workers of a Ray cluster."""
 
 from __future__ import annotations
 
@@ -18,15 +18,15 @@ from torchdyn_plan.training.goal_task import DDPGRecipe, GoalTask
 
 
 def on_cluster(kind: type[DDPG]) -> type[Any]:
-    """``kind``, `DDPG` or what learns in another way, with its episodes run by workers, as of `ClusterDDPG`."""
+    """``kind``, which is `DDPG` or a subclass, with its episodes run by workers, see `ClusterDDPG`."""
     return ClusterDDPG if kind is DDPG else type(f"Cluster{kind.__name__}", (ClusterDDPG, kind), {})
 
 
 class ClusterDDPG(DDPG):
     """`DDPG` whose environments are spread evenly over Ray workers; each worker has its own series of episodes.
 
-    A round waits for all workers, and the next one begins with the policy that the updates left. Workers keep their own
-    random states, which no checkpoint holds: a resumed training continues, but not bit for bit.
+    A round waits for all workers, and the next one starts with the updated policy. Workers have their own random
+    states, which are not in the checkpoint: a resumed training continues, but not bit for bit.
     """
 
     def __init__(
@@ -41,11 +41,11 @@ class ClusterDDPG(DDPG):
         """Networks and replay here, collection there.
 
         Args:
-            task: as for `DDPG`; workers import it, so it must be importable there.
-            recipe: as for `DDPG`.
+            task: see `DDPG`; workers import it, so it must be importable there.
+            recipe: see `DDPG`.
             workers: number of Ray workers.
             device: where networks learn.
-            cluster: arguments of `ray.init`; a cluster of ``workers`` processors on this machine by default.
+            cluster: arguments of `ray.init`; a cluster of ``workers`` CPUs on this machine by default.
 
         Raises:
             InputError: the environments cannot be spread evenly.
@@ -78,7 +78,7 @@ class ClusterDDPG(DDPG):
         )
 
     def restart_collection(self, episode: int) -> None:
-        """Nothing to do: workers start their series over."""
+        """Nothing to do: workers restart their series."""
 
 
 def _make_env(task: GoalTask, num_envs: int, seed: int) -> EnvBase:

@@ -1,4 +1,4 @@
-"""Training data by simulation, in shards: paths of a task's targets, and arrivals of its static planners."""
+"""Collection of training data in shards: paths of a task's targets, and arrivals of its static planners."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ ENTRIES = {
 }
 """Tensors in a shard of each kind of data."""
 SERIES = 1_000_003
-"""Seeds of draws are this many times the series' seed, plus a number within the series: no two series share one."""
+"""Draws are seeded by this number times the series' seed plus an index, so that no two series share a seed."""
 
 
 def collect(
@@ -47,7 +47,7 @@ def collect(
     planner: StaticPlanner | None = None,
     name: str = "own",
 ) -> None:
-    """Write shards of data and their description into ``out``; complete existing shards are kept.
+    """Write shards of data and their description into ``out``; existing complete shards are kept.
 
     Args:
         task: a task, or its name.
@@ -55,7 +55,7 @@ def collect(
         out: folder; it may hold both paths and arrivals of one scene.
         episodes: paths, or sequences of runs.
         seed: series of episodes.
-        num_envs: episodes that run side by side; numbers of a block are drawn together.
+        num_envs: episodes that run in parallel; random numbers are drawn for the whole block.
         num_threads: of the simulation, 0 for all cores; does not change the data.
         static: name of the static planner whose arrivals are measured; the task's default for None.
         weights: policy of that static planner, a file or a folder of its training; the shipped one for None.
@@ -63,15 +63,17 @@ def collect(
         name: name of ``planner`` in the description.
 
     Raises:
-        InputError: the task records no such data, an argument is wrong, or a shard that is there was made in another
-            scene or with other arguments, or is damaged.
+        InputError: the task records no such data, an argument is wrong, or an existing shard is damaged or was made in
+            another scene or with other arguments.
         WeightsError: there are no such weights.
         OutputError: the folder cannot be written to.
     """
     task = load_task(task)
     check_choice("kind of data", what, shards.SHARD)
     if weights is not None and (what != "arrivals" or planner is not None):
-        raise InputError(f"weights are of the task's own static planner, whose arrivals are measured, got {weights}")
+        raise InputError(
+            f"weights are for the task's own static planner: give either weights or a planner, got {weights}"
+        )
     driver = name if planner is not None else static or task.default_static
     file = None if weights is None else str(Actor.find(weights))
     wanted = _Wanted(task.name, what, str(out), episodes, seed, num_envs, num_threads, driver, file)
@@ -94,17 +96,17 @@ def collect(
 
 
 def collect_tracks(task: Task | str, file: Path, out: Path, *, seed: int = 0) -> int:
-    """Write recorded targets into ``out``, in the format in which `collect` writes paths; returns their number.
+    """Write recorded targets into ``out``, in the format of `collect`'s paths; returns their number.
 
     Args:
-        task: whose control step they are brought to, or its name.
-        file: as `torchdyn_plan.training.tracks.read_tracks` reads it.
+        task: the task to whose control step they are resampled, or its name.
+        file: see `torchdyn_plan.training.tracks.read_tracks`.
         out: folder.
-        seed: number of the series that they make up.
+        seed: number of their series.
 
     Raises:
-        InputError: the file is of no use (the message names row and column), fewer than two tracks are long enough
-            for the task's forecaster, or other data lie in the folder.
+        InputError: the file is invalid (the message names row and column), fewer than two tracks are long enough for
+            the task's forecaster, or the folder holds other data.
         OutputError: the folder cannot be written to.
     """
     task = load_task(task)
@@ -128,7 +130,7 @@ def collect_tracks(task: Task | str, file: Path, out: Path, *, seed: int = 0) ->
 
 
 def _check_long_enough(task: Task, file: Path, paths: list[Tensor]) -> None:
-    """Raise `InputError` unless two of ``paths`` have a window: one to fit to, and one to hold out."""
+    """Raise `InputError` unless two of ``paths`` are long enough for a window: one for training, one held out."""
     needed = 2
     if task.fitting is not None:
         fitting = task.fitting()
@@ -143,7 +145,7 @@ def _check_long_enough(task: Task, file: Path, paths: list[Tensor]) -> None:
 
 @dataclass(frozen=True)
 class _Wanted:
-    """What a collection was asked for: the arguments in its description."""
+    """The arguments of a collection, as stored in its description."""
 
     task: str
     what: str
@@ -164,7 +166,7 @@ class _Wanted:
 
     @property
     def shards(self) -> int:
-        """How many shards there are."""
+        """Number of shards."""
         return len(shard_sizes(self.what, self.episodes))
 
     def blocks(self, index: int) -> list[Tensor]:
@@ -175,7 +177,7 @@ class _Wanted:
         return [torch.arange(first, min(first + self.num_envs, last)) for first in starts]
 
     def metadata(self, index: int, scene: str) -> dict[str, str]:
-        """Everything that determines the content of a shard, apart from its name."""
+        """Everything that determines the content of a shard, except its name."""
         episodes = sum(map(len, self.blocks(index)))
         made = {"scene": scene, "num_envs": str(self.num_envs), "episodes": str(episodes)}
         if self.what == "arrivals":
@@ -186,7 +188,7 @@ class _Wanted:
 
 
 def _recorder(task: Task, wanted: _Wanted, planner: StaticPlanner | None) -> Callable[[int], dict[str, Tensor]]:
-    """What fills a shard by its index; raises `InputError` if the task has nothing that does."""
+    """The function that records a shard by its index; raises `InputError` if the task has none."""
     threads = wanted.num_threads
     if wanted.what == "paths":
         record_paths = task.record_paths
@@ -209,12 +211,14 @@ def _recorder(task: Task, wanted: _Wanted, planner: StaticPlanner | None) -> Cal
 def _static_planner(task: Task, wanted: _Wanted) -> Any:
     made = task.static_planner(wanted.static, weights=wanted.weights)
     if wanted.weights is not None and not isinstance(made, PolicyPlanner):
-        raise InputError(f"weights are of a policy, but {wanted.static} of {task.name} is none: got {wanted.weights}")
+        raise InputError(
+            f"weights are for a policy, but {wanted.static} of {task.name} is not one: got {wanted.weights}"
+        )
     return made
 
 
 def _whole(wanted: _Wanted, tensors: Mapping[str, Tensor]) -> dict[str, Tensor]:
-    """What was recorded, as it can be written; raises `InputError` where the task's recorder left something out."""
+    """The recorded tensors, ready to be written; raises `InputError` if the task's recorder left something out."""
     missing = [name for name in ENTRIES[wanted.what] if name not in tensors]
     if missing:
         raise InputError(f"what {wanted.task} records of {wanted.what} lacks {', '.join(missing)}")

@@ -1,4 +1,4 @@
-"""Deep deterministic policy gradients with hindsight, in TorchRL's terms, for any task of reaching goals."""
+"""DDPG with hindsight experience replay in TorchRL, for any goal-reaching task."""
 
 from __future__ import annotations
 
@@ -24,10 +24,10 @@ from torchdyn_plan.training.goal_task import SEEN, DDPGRecipe, GoalReplay, GoalT
 
 
 class DDPG:
-    """Everything that learns, and everything that its next step depends on."""
+    """The learner, with everything that its next step depends on."""
 
     def __init__(self, task: GoalTask, recipe: DDPGRecipe, *, device: str = "cpu") -> None:
-        """Networks, losses, replay and collection of ``recipe``, at their beginning; they learn on ``device``."""
+        """New networks, losses, replay and collection of ``recipe``; they learn on ``device``."""
         check_device(device)
         torch.manual_seed(recipe.seed)
         self.device = torch.device(device)
@@ -46,7 +46,7 @@ class DDPG:
         self._rollouts: Iterator[TensorDictBase] = iter(self.collector)
 
     def prepare(self, policy: TensorDictModule) -> None:
-        """Make what updates need besides actor and critic; ``policy`` is the actor as a tensordict module."""
+        """Make losses, targets and optimiser; ``policy`` is the actor as a tensordict module."""
         value = ValueOperator(self.critic, in_keys=[*SEEN, keys.ACTION])
         self.loss = PenalisedDDPGLoss(policy, value, delay_actor=True, delay_value=True)
         self.loss.make_value_estimator(self.make_targets())
@@ -58,7 +58,7 @@ class DDPG:
         )
 
     def make_optimiser(self, actor: Iterable[Any], critic: Iterable[Any]) -> torch.optim.Optimizer:
-        """Adam with one group of parameters for each network, at its own rate."""
+        """Adam with one parameter group for each network, at its own rate."""
         groups = [
             {"params": [entry for entry in entries if isinstance(entry, nn.Parameter)], "lr": rate}
             for entries, rate in ((actor, self.recipe.lr_actor), (critic, self.recipe.lr_critic))
@@ -67,11 +67,11 @@ class DDPG:
 
     @property
     def learned(self) -> Actor:
-        """The policy that is scored and kept."""
+        """The policy that is scored and saved."""
         return self.actor
 
     def make_targets(self) -> Any:
-        """What computes the critic's targets."""
+        """The estimator of the critic's targets."""
         lowest, highest = self.recipe.bounds
         targets = BoundedTD0(
             lowest=lowest, highest=highest, gamma=self.recipe.gamma, value_network=self.loss.actor_critic
@@ -80,7 +80,7 @@ class DDPG:
         return targets
 
     def make_collector(self, policy: TensorDictModuleBase) -> BaseCollector:
-        """What runs a whole episode of every environment in each round."""
+        """The collector, which runs a whole episode of every environment in each round."""
         devices = {} if self.device.type == "cpu" else {"policy_device": self.device, "env_device": "cpu"}
         return Collector(
             self.env, policy, frames_per_batch=self.frames, total_frames=-1, storing_device="cpu", **devices
@@ -88,7 +88,7 @@ class DDPG:
 
     @property
     def frames(self) -> int:
-        """Transitions that a round collects."""
+        """Transitions collected in a round."""
         return self.recipe.num_envs * self.task.length
 
     def iterate(self) -> dict[str, float]:
@@ -113,7 +113,7 @@ class DDPG:
         return {"reward": float(episodes["next", "reward"].mean())}
 
     def standardise(self) -> None:
-        """Set the inputs' statistics of all networks by what is in the replay buffer."""
+        """Set the input statistics of all networks from the replay buffer."""
         seen = self.replay.tensors()
         self.actor.features.set_statistics(seen[keys.OBSERVATION], seen[keys.DESIRED_GOAL])
         for name in ("shift", "scale"):
@@ -154,11 +154,11 @@ class DDPG:
         return {"loss_actor": actor.detach(), "loss_critic": critic.detach(), "value": value.detach()}
 
     def follow(self) -> None:
-        """Let the targets take over their share of the networks."""
+        """Soft update of the target networks."""
         self.targets.step()
 
     def check_update(self, number: int, *values: Tensor) -> None:
-        """Raise `TrainingError` unless losses and gradient norms, actor's and critic's, are numbers."""
+        """Raise `TrainingError` unless the losses and gradient norms of actor and critic are finite."""
         figures = [float(value) for value in values]
         if not all(map(math.isfinite, figures)):
             raise TrainingError(
@@ -181,11 +181,11 @@ class DDPG:
         }
 
     def progress(self) -> dict[str, Any]:
-        """What `tensors` cannot hold: JSON values."""
+        """JSON values that complete `tensors`."""
         return {"iteration": self.iteration, "cursor": self.replay.cursor, "episode": self.env.next_episode}
 
     def restore(self, tensors: dict[str, Tensor], progress: dict[str, Any]) -> None:
-        """Go back to where `tensors` and `progress` were taken."""
+        """Restore the state of `tensors` and `progress`."""
         self.networks.load_state_dict(group(tensors, "loss"), strict=False)
         states: dict[int, dict[str, Tensor]] = {}
         for name, value in group(tensors, "optimiser").items():
@@ -198,8 +198,8 @@ class DDPG:
         torch.set_rng_state(tensors["generator"])
 
     def restart_collection(self, episode: int) -> None:
-        """Start the environments over, so that the next reset after this one takes number ``episode``."""
-        # Episodes end all at once: the simulators are at a reset, which their episodes' numbers decide.
+        """Restart the environments, so that the next reset after this one takes number ``episode``."""
+        # All episodes end at the same time, so the simulators are at a reset, determined by the episodes' numbers.
         self.env.start_from(episode - self.recipe.num_envs)
         self.collector.reset()
 

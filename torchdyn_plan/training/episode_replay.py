@@ -1,4 +1,4 @@
-"""What replay buffers of whole episodes share: how they are filled, written to a checkpoint and restored."""
+"""Common code of replay buffers of whole episodes: filling, writing to a checkpoint, restoring."""
 
 from __future__ import annotations
 
@@ -20,16 +20,16 @@ def episode_storage(capacity: int, length: int, device: torch.device | str = "cp
 
 
 class EpisodeReplayBuffer(ReplayBuffer):
-    """A replay buffer of episodes of one length, laid end to end."""
+    """A replay buffer of concatenated episodes of equal length."""
 
     length: int
     """Transitions in an episode."""
 
     def extend(self, data: Any, **settings: Any) -> Any:
-        """Add whole episodes, batch ``(*N, length)``, or ``(N * length,)`` one after the other.
+        """Add whole episodes, batch ``(*N, length)``, or concatenated, ``(N * length,)``.
 
         Raises:
-            InputError: the batch is not so long, or an episode does not end where it should.
+            InputError: the batch has another length, or an episode does not end where it should.
         """
         batch = tuple(data.batch_size)
         if len(batch) > 1 and batch[-1] != self.length:
@@ -43,16 +43,16 @@ class EpisodeReplayBuffer(ReplayBuffer):
         return super().extend(rows, **settings)
 
     def add(self, data: Any) -> int:
-        """Refused: a single transition is no whole episode."""
+        """Refused: a single transition is not a whole episode."""
         raise InputError(f"transitions must come as whole episodes of {self.length}, got one: use extend")
 
     def tensors(self) -> dict[str, Tensor]:
-        """What is stored, by flat names, in the order of storage."""
+        """The stored tensors, by flat names, in the order of storage."""
         stored = self._storage[: len(self)]
         return {".".join(key) if isinstance(key, tuple) else key: value for key, value in stored.items(True, True)}
 
     def restore(self, tensors: dict[str, Tensor], cursor: int) -> None:
-        """Fill an empty buffer with what `tensors` gave, the next episode going to ``cursor``."""
+        """Fill an empty buffer with the result of `tensors`; the next episode goes to ``cursor``."""
         count = len(next(iter(tensors.values())))
         entries = TensorDict({}, batch_size=[count])
         for name, value in tensors.items():
@@ -63,7 +63,7 @@ class EpisodeReplayBuffer(ReplayBuffer):
 
     @property
     def cursor(self) -> int:
-        """Where the next episode goes."""
+        """Position of the next episode."""
         writer: Any = self._writer
         return int(writer._cursor)
 

@@ -1,4 +1,4 @@
-"""What `DDPG` adds to TorchRL's exploration, loss and value targets."""
+"""Additions of `DDPG` to TorchRL's exploration, loss and value targets."""
 
 from __future__ import annotations
 
@@ -15,14 +15,14 @@ from torchdyn_plan import keys
 
 
 class RandomActionModule(TensorDictModuleBase):
-    """Replaces a share of the actions by random ones, as hindsight replay's authors do (Andrychowicz et al., 2017).
+    """Replaces a share of the actions by random ones, as in hindsight replay (Andrychowicz et al., 2017).
 
-    TorchRL's `EGreedyModule`, but that it draws on the CPU wherever the policy runs: checkpoints hold that generator
-    alone, and a training that is resumed must draw the same.
+    Like TorchRL's `EGreedyModule`, but it always draws on the CPU: checkpoints hold only that generator, and a resumed
+    training must draw the same.
     """
 
     def __init__(self, spec: Any, share: float) -> None:
-        """Draw from ``spec``, of one environment, with probability ``share`` a row."""
+        """Draw from ``spec``, of one environment, with probability ``share`` in each row."""
         super().__init__()
         self.spec, self.share = spec, share
         self.in_keys = self.out_keys = [keys.ACTION]
@@ -42,7 +42,7 @@ class PenalisedDDPGLoss(DDPGLoss):
     action_penalty: float = 0.0
 
     def loss_actor(self, tensordict: TensorDictBase) -> Any:
-        """TorchRL's, but for the penalty."""
+        """TorchRL's, plus the penalty."""
         seen = tensordict.select(*self.actor_in_keys, *self.value_exclusive_keys, strict=False).detach()
         with self.actor_network_params.to_module(self.actor_network, preserve_module_state=False):
             acted = self.actor_network(seen)
@@ -54,7 +54,7 @@ class PenalisedDDPGLoss(DDPGLoss):
 
 
 class BoundedTD0(TD0Estimator):
-    """TorchRL's one-step value targets, kept within what a return can be (Andrychowicz et al., 2017, appendix)."""
+    """TorchRL's one-step value targets, clipped to the possible returns (Andrychowicz et al., 2017, appendix)."""
 
     def __init__(self, *, lowest: float, highest: float, **settings: Any) -> None:
         """Bound by ``lowest`` and ``highest``; ``settings`` are TorchRL's."""

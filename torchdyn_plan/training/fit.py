@@ -1,9 +1,9 @@
 """Supervised fits of the forecaster and the arrival-time network to a task's collected data.
 
-Every fit takes the task, the folder ``data`` of its collected shards and their descriptions, a folder ``out`` which
-gets a folder of the network's name with checkpoint, curve, weights and card, and a `Recipe`, the task's own for None; a
-batch of paths is of fresh random windows. It returns the weights' file, and raises `InputError` where data is missing,
-damaged or of another scene, and `TrainingError` where the loss is no number or a checkpoint is damaged or of another
+Every fit takes the task; the folder ``data`` of its collected shards and their descriptions; a folder ``out``, which
+gets a folder of the network's name with checkpoint, curve, weights and card; and a `Recipe`, the task's own for None. A
+batch of paths consists of new random windows. A fit returns the weights' file. It raises `InputError` if data is
+missing, damaged or of another scene, and `TrainingError` if the loss is NaN or a checkpoint is damaged or of another
 recipe.
 """
 
@@ -35,18 +35,18 @@ from torchdyn_plan.training.sighted_data import SightedSamples
 from torchdyn_plan.training.windows import Windows
 
 ROWS = 4096
-"""Rows that a network sees at once when it is scored."""
+"""Rows that a network evaluates at once when it is scored."""
 
 
 def task_fitting(task: Task) -> Fitting:
-    """What ``task`` says of its networks; raises `InputError` if it has none."""
+    """The `Fitting` of ``task``; raises `InputError` if it has no networks."""
     if task.fitting is None:
         raise InputError(f"{task.name} has no networks to fit")
     return task.fitting()
 
 
 def words_of(task: Task) -> str:
-    """What the command line calls ``task``, with its scene if that is not the one that its name alone stands for."""
+    """Command-line arguments that select ``task``, including its scene if it is not the default one."""
     return task.name if task.scene == next(iter(task.scenes), "") else f"{task.name} --scene {task.scene}"
 
 
@@ -62,9 +62,9 @@ def fit_forecaster(
 ) -> Path:
     """Fit a `Forecaster` to the ``paths`` in ``data``; one in ten episodes is held out and scored.
 
-    One that is ``tracked`` sees the paths through sensors and a track, as the task's `Fitting.sighting` says.
-    ``config`` is the task's by default; ``name`` is that of its folder in ``out``; without ``resume`` a checkpoint in
-    ``out`` is not continued.
+    A ``tracked`` forecaster sees the paths through sensors and a track, see `Fitting.sighting`. ``config`` is the
+    task's by default; ``name`` is the name of its folder in ``out``; without ``resume`` a checkpoint in ``out`` is not
+    continued.
     """
     fitting = task_fitting(task)
     config, recipe = config or fitting.forecaster, recipe or fitting.recipe("forecaster")
@@ -100,21 +100,21 @@ def fit_forecaster(
 
 
 def path_samples(task: Task, data: Path, config: ForecasterConfig, seed: int) -> PathSamples | SightedSamples:
-    """The paths in ``data`` as windows for a forecaster of ``config``; ``seed`` is of what is held out."""
+    """The paths in ``data`` as windows for a forecaster of ``config``; ``seed`` selects the held-out ones."""
     fitting = task_fitting(task)
     drawing = replace(fitting.windows, history=config.history, horizon=config.horizon)
     if not config.tracked:
         return PathSamples.load(data, drawing, seed)
-    # A track is of use from its second measurement on.
+    # A track is usable from its second measurement on.
     drawing = replace(drawing, first_step=1)
     return SightedSamples.load(data, drawing, seed, fitting.sighting, control_step=task.control_step)
 
 
 def line_loss(network: Forecaster, windows: Windows, *, control_step: float) -> Tensor:
-    """Mean absolute error on the unreflected line, relative to what a step ahead is worth, and to what is known.
+    """Mean absolute error on the unreflected line, scaled by the step ahead and by the track's uncertainty.
 
-    Level errors count until the target is lost, so that the line is where it would be if it were not; heights count
-    always, so that they tell what is likelier.
+    Horizontal errors count until the target is lost, so that the line continues as if it were not lost; heights always
+    count, so that they show which outcome is likelier.
     """
     device = network.head.weight.device
     difference = network.unreflected(*(part.to(device) for part in windows.seen)) - windows.future.to(device)
@@ -143,9 +143,9 @@ def fit_eta(
 ) -> Path:
     """Fit an `ETANetwork` to the ``arrivals`` in ``data``; one in ten runs is held out and scored.
 
-    One without the class *never* is fitted to the times until the robot was as near as it came. ``config`` is the
-    task's by default; ``name`` is that of its folder in ``out``; data of another static planner than ``static`` are
-    refused, unless it is None; without ``resume`` a checkpoint in ``out`` is not continued.
+    A network without the class *never* is fitted to the times until the robot was nearest to the goal. ``config`` is
+    the task's by default; ``name`` is the name of its folder in ``out``; data of another static planner than ``static``
+    is refused, unless it is None; without ``resume`` a checkpoint in ``out`` is not continued.
     """
     fitting = task_fitting(task)
     config, recipe = config or fitting.eta, recipe or fitting.recipe("eta")
@@ -200,7 +200,7 @@ def _forecast_figures(tables: Tables) -> dict[str, float]:
     errors, *lost = tables.values()
     figures: dict[str, Any] = {}
     for row in errors:
-        # A curve of every kind at every sensor could not be read.
+        # A curve for every kind and every sensor would be unreadable.
         if row["windows"] == "fast" or (row["windows"] != "still" and "sensor" not in row):
             figures[f"{_of(row)}{row['windows']}_{row['ahead']}"] = row["median"]
     for row in (row for rows in lost for row in rows):
@@ -209,7 +209,7 @@ def _forecast_figures(tables: Tables) -> dict[str, float]:
 
 
 def _of(row: dict[str, Any]) -> str:
-    """Begin of the name of a figure: the sensor that it is of, if any."""
+    """Prefix of a figure's name: its sensor, if any."""
     return f"{row['sensor']}: " if "sensor" in row else ""
 
 

@@ -1,4 +1,4 @@
-"""The fit of a spread to a frozen forecaster's errors, and how well it is calibrated; as the fits in `fit` go."""
+"""The fit of a spread to a frozen forecaster's errors, and its calibration; see `fit` for the common arguments."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ from torchdyn_plan.training.sighted_data import SightedSamples
 from torchdyn_plan.training.windows import Windows
 
 ROWS = 1024
-"""Rows that the networks see at once when they are scored."""
+"""Rows that the networks evaluate at once when they are scored."""
 
 
 def fit_spread(
@@ -40,14 +40,14 @@ def fit_spread(
     resume: bool = True,
     name: str = SpreadNetwork.kind,
 ) -> Path:
-    """Fit a `SpreadNetwork` to the errors that ``forecaster`` makes on the ``paths`` in ``data``; it stays as it is.
+    """Fit a `SpreadNetwork` to the errors of ``forecaster``, which does not change, on the ``paths`` in ``data``.
 
-    With the paths and the seed that the forecaster was fitted with, the same episodes are held out: coverage is
+    With the paths and the seed of the forecaster's own fit, the same episodes are held out, so that coverage is
     measured on errors that neither network was fitted to.
 
-    ``forecaster`` is a name that ships, a file or a folder: else a `WeightsError`. ``config`` has the forecaster's
-    sizes by default; ``name`` is that of its folder in ``out``; without ``resume`` a checkpoint in ``out`` is not
-    continued.
+    ``forecaster`` is a shipped name, a file or a folder; otherwise a `WeightsError` is raised. ``config`` has the
+    forecaster's sizes by default; ``name`` is the name of its folder in ``out``; without ``resume`` a checkpoint in
+    ``out`` is not continued.
     """
     fitting = task_fitting(task)
     if not fitting.spread:
@@ -83,10 +83,10 @@ def fit_spread(
 def spread_loss(forecaster: Forecaster, network: SpreadNetwork, windows: Windows) -> Tensor:
     """Negative log-likelihood of the errors' sizes (logistic in their logarithm), and of being lost or not.
 
-    Errors of a forecaster that sees by a track are those of the measurements, with lighter tails than the spread has:
-    there the quantiles `QUANTILES` of their logarithm count (pinball loss) in place of the likelihood, so that
-    intervals cover what they say. All are proper scores, averaged over the steps ahead. Errors count until the target
-    is lost.
+    A tracked forecaster's errors come from the measurements and have lighter tails than the spread's distribution. For
+    it the quantiles `QUANTILES` of their logarithm are fitted (pinball loss) instead of the likelihood, so that the
+    intervals have the right coverage. All are proper scores, averaged over the steps ahead. Errors count until the
+    target is lost.
     """
     device = network.head.weight.device
     with torch.no_grad():
@@ -107,11 +107,11 @@ def spread_loss(forecaster: Forecaster, network: SpreadNetwork, windows: Windows
 
 
 QUANTILES = (0.5, 0.8, 0.95)
-"""Shares of errors that lie within the intervals by which the spread of a tracked forecaster is fitted."""
+"""Coverage of the intervals to which the spread of a tracked forecaster is fitted."""
 
 
 def _pinball(beyond: Tensor, share: float) -> Tensor:
-    """Loss whose mean is least where a ``share`` of the values ``beyond`` (*B,) is negative."""
+    """Pinball loss: its mean is smallest if a ``share`` of the values ``beyond`` (*B,) is negative."""
     return torch.maximum(share * beyond, (share - 1.0) * beyond)
 
 
@@ -145,7 +145,7 @@ def _tables(
 
 
 def predict(forecaster: Forecaster, network: SpreadNetwork, *seen: Tensor) -> tuple[Tensor, Spread]:
-    """Forecasts ``(n, F, 3)`` [m, world] and their spread for what is ``seen`` of n targets, on the CPU."""
+    """Forecasts ``(n, F, 3)`` [m, world] and their spread for the inputs ``seen`` of n targets, on the CPU."""
     device = network.head.weight.device
     parts: list[Sequence[Tensor]] = []
     for rows in zip(*(part.split(ROWS) for part in seen), strict=True):

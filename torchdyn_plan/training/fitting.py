@@ -1,4 +1,4 @@
-"""What the fits of a task's networks need to know about it."""
+"""What a task defines for the fits of its networks."""
 
 from __future__ import annotations
 
@@ -24,16 +24,16 @@ RECIPES = {
     "eta": Recipe(steps=64_000, batch=1024, lr=2e-3),
     "spread": Recipe(steps=3_000, batch=256, lr=2e-3, validations=8),
 }
-"""How each network is fitted where its task does not say otherwise."""
+"""Default recipe of each network."""
 
 
 class ExtraCoverage(NamedTuple):
-    """Windows of targets that move otherwise than those in the data, to see whether a spread still covers them."""
+    """Windows of targets that move differently from the training data, to test a spread's coverage."""
 
     caption: str
-    """Of the table."""
+    """Caption of the table."""
     windows: Sequence[tuple[dict[str, Any], Windows]]
-    """Windows, and the first columns of the rows of the table that tell of them."""
+    """Windows, with the first columns of their rows in the table."""
 
 
 def _every_arrival(held: Arrivals) -> dict[str, Tensor]:
@@ -42,30 +42,30 @@ def _every_arrival(held: Arrivals) -> dict[str, Tensor]:
 
 @dataclass(frozen=True, kw_only=True)
 class Fitting:
-    """Sizes of a task's networks, and how they are scored."""
+    """Sizes of a task's networks, and how they are fitted and scored."""
 
     forecaster: ForecasterConfig
-    """Of the forecaster, unless another is asked for."""
+    """Default configuration of the forecaster."""
     eta: ETAConfig = field(default_factory=ETAConfig)
-    """Of the arrival-time network, unless another is asked for."""
+    """Default configuration of the arrival-time network."""
     noisy_forecaster: ForecasterConfig | None = None
-    """Of a second forecaster, for targets that are measured with noise and seen by a track; None for none."""
+    """Configuration of a second forecaster, for noisy measurements seen through a track; None for none."""
     sighting: Sighting = field(default_factory=Sighting)
-    """How that one sees the recorded paths."""
+    """How the second forecaster sees the recorded paths."""
     spread: bool = False
     """Whether a spread can be fitted to the forecaster's errors; its sizes are the forecaster's."""
     windows: WindowConfig = field(default_factory=WindowConfig)
     """How windows are drawn from paths; history and horizon are the forecaster's."""
     ahead: tuple[int, ...] = ()
-    """Control steps ahead at which forecasts are scored; for none a twelfth, a third and all of the horizon."""
+    """Control steps ahead at which forecasts are scored; if empty, a twelfth, a third and all of the horizon."""
     fast: float = FAST
-    """Motion from which a target is fast [m a step]."""
+    """Speed from which a target is fast [m a step]."""
     near: float = NEAR
-    """Distance along both level axes within which a robot that waits has the target [m]: a spread is scored by it."""
+    """Distance along both horizontal axes within which a waiting robot has the target [m]; used to score a spread."""
     lost: Lost | None = None
-    """When a target is lost, which is scored too; None if it cannot be."""
+    """Decides when a target is lost, which is also scored; None if targets cannot be lost."""
     recipes: Mapping[str, Recipe] = field(default_factory=dict)
-    """How networks are fitted, by name, where it is not as in `RECIPES`."""
+    """Recipes by network that replace those in `RECIPES`."""
     groups: Callable[[Arrivals], dict[str, Tensor]] = _every_arrival
     """Masks ``(n,)`` of the arrivals that are scored together."""
     extra_coverage: Callable[[WindowConfig], ExtraCoverage] | None = None
@@ -82,7 +82,7 @@ class Fitting:
         check_number("near", self.near, minimum=0.0)
         horizon = self.forecaster.horizon
         if not self.ahead:
-            # Frozen, but for what is left to the forecaster.
+            # Frozen dataclass; only fields left to the forecaster are set here.
             object.__setattr__(self, "ahead", tuple(sorted({max(1, horizon // share) for share in (12, 3, 1)})))
         for steps in self.ahead:
             check_number("ahead", steps, minimum=1, maximum=horizon, integer=True)

@@ -1,4 +1,4 @@
-"""What a training of a policy is given: a task of reaching goals, and how to go about it."""
+"""Inputs of a policy training: a goal-reaching task and a recipe."""
 
 from __future__ import annotations
 
@@ -18,17 +18,17 @@ from torchdyn_plan.nets.policy import Actor, PolicyConfig
 from torchdyn_plan.training.hindsight import HindsightReplayBuffer
 
 SEEN: list[Any] = [keys.OBSERVATION, keys.DESIRED_GOAL]
-"""What a policy reads."""
+"""Keys that a policy reads."""
 ALGORITHM_OWNS = ("iterations", "lr_actor", "lr_critic", "final_rate", "gamma", "tau")
-"""Fields of a recipe that follow from how one learns; the others follow from the task."""
+"""Fields of a recipe that depend on the algorithm; the others depend on the task."""
 
 
 class GoalReplay(Protocol):
-    """A replay buffer of whole episodes, as the training sees it."""
+    """Interface of a replay buffer of whole episodes."""
 
     @property
     def cursor(self) -> int:
-        """Where the next episode goes."""
+        """Position of the next episode."""
         ...
 
     def extend(self, data: Any, **settings: Any) -> Any:
@@ -40,23 +40,23 @@ class GoalReplay(Protocol):
         ...
 
     def tensors(self) -> dict[str, Tensor]:
-        """What is stored, by flat names."""
+        """The stored tensors, by flat names."""
         ...
 
     def restore(self, tensors: dict[str, Tensor], cursor: int) -> None:
-        """Fill an empty buffer with what `tensors` gave."""
+        """Fill an empty buffer with the result of `tensors`."""
         ...
 
 
 class GoalTask(ABC):
-    """A task of reaching goals, as the training sees it."""
+    """Interface of a goal-reaching task."""
 
     policy_config: PolicyConfig
     """Sizes of the networks."""
     stored: tuple[Any, ...] = ()
     """Keys of a transition that `reward` reads, in addition to those that every learner needs."""
     length: int
-    """Actions in an episode; all episodes have as many."""
+    """Actions in an episode, the same for all episodes."""
 
     @abstractmethod
     def make_env(self, num_envs: int, *, seed: int) -> EnvBase:
@@ -64,18 +64,18 @@ class GoalTask(ABC):
 
     @abstractmethod
     def reward(self, transitions: TensorDictBase) -> Tensor:
-        """Rewards ``(B, 1)`` of transitions for the ``desired_goal`` that they have."""
+        """Rewards ``(B, 1)`` of transitions for their ``desired_goal``."""
 
     @abstractmethod
     def score(self, actor: Actor) -> dict[str, float]:
-        """How well ``actor`` does without exploration; ``success`` is one of the figures."""
+        """Score of ``actor`` without exploration; ``success`` is one of the figures."""
 
     @abstractmethod
     def settings(self) -> dict[str, Any]:
-        """What must be the same when a training is continued: JSON values."""
+        """JSON values that must be equal when a training is continued."""
 
     def make_replay(self, recipe: DDPGRecipe, device: torch.device) -> GoalReplay:
-        """What transitions are kept in and sampled from: hindsight experience replay, unless a task says otherwise."""
+        """The replay buffer: hindsight experience replay by default."""
         return HindsightReplayBuffer(
             self.reward,
             capacity=recipe.capacity,
@@ -93,7 +93,7 @@ class DDPGRecipe:
     iterations: int = 400
     """Rounds of collection and updates."""
     num_envs: int = 32
-    """Episodes that run side by side: one round collects a whole episode of each."""
+    """Episodes that run in parallel: one round collects a whole episode of each."""
     updates: int = 100
     """Optimiser steps a round."""
     batch: int = 256
@@ -103,32 +103,32 @@ class DDPGRecipe:
     her_ratio: float = 0.8
     """Share of a batch whose goals are replaced by achieved ones."""
     warmup: int = 4
-    """First rounds, of random actions, from which inputs are standardised."""
+    """First rounds, with random actions, from which input statistics are taken."""
     lr_actor: float = 5e-4
     """Learning rate of the actor."""
     lr_critic: float = 1e-3
     """Learning rate of the critic."""
     final_rate: float = 0.1
-    """Share of the learning rates that is left at the end; they fall along a cosine."""
+    """Final share of the learning rates, which fall along a cosine."""
     gamma: float = 0.97
-    """Discount of an action."""
+    """Discount per action."""
     tau: float = 0.01
-    """Share of the networks that their targets take over at each update."""
+    """Soft-update rate of the target networks."""
     noise: float = 0.2
-    """Deviation of the noise on actions."""
+    """Standard deviation of the noise on actions."""
     random_share: float = 0.1
     """Share of actions drawn at random."""
     action_penalty: float = 0.03
-    """Weight of the mean squared action in the actor's loss, times the greatest value."""
+    """Weight of the mean squared action in the actor's loss, times the largest value."""
     clip_return: bool = False
-    """Whether values stay within the returns that rewards of -1 and 0 can have; for tasks that have no others."""
+    """Whether to clip values to the possible returns of rewards -1 and 0; for tasks with only these rewards."""
     clip: float = 10.0
-    """Greatest norm of a gradient."""
+    """Largest gradient norm."""
     seed: int = 0
-    """Of initialisation, episodes and every draw."""
+    """Seed of initialisation, episodes and all draws."""
 
     algorithm: ClassVar[str] = "ddpg"
-    """What learns by it: one of `torchdyn_plan.training.algorithms.ALGORITHMS`."""
+    """Its algorithm: one of `torchdyn_plan.training.algorithms.ALGORITHMS`."""
 
     def __post_init__(self) -> None:
         for name in ("iterations", "num_envs", "updates", "batch", "capacity"):
@@ -144,18 +144,18 @@ class DDPGRecipe:
 
     @classmethod
     def like(cls, recipe: DDPGRecipe) -> Self:
-        """What ``recipe`` asks for on behalf of its task, with this algorithm's own defaults for all else."""
+        """The task-dependent fields of ``recipe``, with this algorithm's defaults for all others."""
         names = [one.name for one in fields(DDPGRecipe) if one.name not in ALGORITHM_OWNS]
         return cls(**{name: getattr(recipe, name) for name in names})
 
     @property
     def bounds(self) -> tuple[float, float]:
-        """Least and greatest value that an action can have."""
+        """Smallest and largest possible value of an action."""
         return (-1.0 / (1.0 - self.gamma), 0.0) if self.clip_return else (-math.inf, math.inf)
 
     @property
     def greatest_penalty(self) -> float:
-        """What the actor's loss gains by a mean squared action of 1."""
+        """Penalty in the actor's loss for a mean squared action of 1."""
         return self.action_penalty / (1.0 - self.gamma)
 
     def rate(self, iteration: int) -> float:
@@ -164,5 +164,5 @@ class DDPGRecipe:
         return self.final_rate + (1.0 - self.final_rate) * cosine
 
     def with_rate(self, lr: float) -> DDPGRecipe:
-        """The recipe with ``lr`` as the critic's learning rate, and the actor's in the same proportion to it."""
+        """The recipe with ``lr`` as the critic's learning rate, and the actor's in the same proportion."""
         return replace(self, lr_critic=lr, lr_actor=lr * (self.lr_actor / self.lr_critic))

@@ -1,4 +1,4 @@
-"""Hindsight experience replay over whole episodes laid end to end."""
+"""Hindsight experience replay over concatenated whole episodes."""
 
 from __future__ import annotations
 
@@ -17,15 +17,15 @@ from torchdyn_plan.training.episode_replay import EpisodeReplayBuffer, episode_s
 NEXT_ACHIEVED = ("next", keys.ACHIEVED_GOAL)
 
 
-# TorchRL itself calls the argument of `extend` by two names.
+# TorchRL itself uses two names for the argument of `extend`.
 class HindsightReplayBuffer(EpisodeReplayBuffer, HERReplayBuffer):  # pyright: ignore[reportIncompatibleMethodOverride]
-    """TorchRL's `HERReplayBuffer` for episodes of one length, strategy *future*.
+    """TorchRL's `HERReplayBuffer` for episodes of equal length, strategy *future*.
 
-    Replaces of the upstream: the key of its cache of episode ends (it holds a tensor, and comparing two of them raises
-    once the storage is full) and the ends themselves (past the wrap they leave out the last one, so that a goal may
-    come from another episode). Here every episode is ``length`` long and the capacity a multiple of it, so that the
-    ends are arithmetic. After relabelling, ``next`` has the goal of the transition: a goal that changed in between is
-    no part of what the transition teaches.
+    Replaces two parts of the upstream class: the key of its cache of episode ends (it contains a tensor, and comparing
+    two of them raises once the storage is full), and the ends themselves (after wrapping around they miss the last one,
+    so that a goal may come from another episode). Here every episode has ``length`` transitions and the capacity is a
+    multiple of it, so that the ends follow by arithmetic. After relabelling, ``next`` has the goal of the transition,
+    because a goal that changed in between should not be learned from it.
     """
 
     def __init__(
@@ -45,7 +45,7 @@ class HindsightReplayBuffer(EpisodeReplayBuffer, HERReplayBuffer):  # pyright: i
             capacity: transitions kept, at least one episode; rounded down to whole episodes.
             length: transitions in an episode.
             batch_size: transitions of a sample.
-            her_ratio: share of a sample that is relabelled: its first rows.
+            her_ratio: share of a sample that is relabelled, its first rows.
             device: where transitions are kept and sampled.
 
         Raises:

@@ -1,4 +1,4 @@
-"""Recorded paths as lines that run on through cushions: what the forecaster is trained on where there are some."""
+"""Recorded paths as unreflected lines, which run on through cushions: the training target on tables with cushions."""
 
 from typing import NamedTuple
 
@@ -6,30 +6,30 @@ import torch
 from torch import Tensor
 
 MARGIN = 0.03
-"""Reversals farther than this from a cushion are none of its bounces [m]."""
+"""Reversals farther than this from a cushion are not bounces off it [m]."""
 SLOWEST = 2e-6
 """Steps shorter than this have no direction [m]."""
 
 
 class Lines(NamedTuple):
-    """Unreflected lines of all paths, end to end, and how to see them from any of their samples."""
+    """Unreflected lines of all paths, concatenated, and the map from each sample's stretch of table to its line."""
 
     track: Tensor
-    """(T, 3): level coordinates on the line, and the height [m]."""
+    """(T, 3): horizontal coordinates on the line, and the height [m]."""
     side: Tensor
-    """(T, 2): 1 or -1, the slope by which the path follows its line."""
+    """(T, 2): 1 or -1, the direction in which the path follows its line."""
     shift: Tensor
-    """(T, 2): how far along the line the sample's stretch of table lies [m]."""
+    """(T, 2): offset of the sample's stretch of table along the line [m]."""
 
 
 def unreflect_paths(positions: Tensor, start: Tensor, half_extent: float | None) -> Lines:
     """Mirror each path at each of its bounces, so that it runs on as one line.
 
-    A bounce turns a coordinate from heading into the nearest cushion to heading out of it; however long the target
-    dwells in a soft cushion, it counts once. Coordinates beyond a cushion, a lost target's too, count as on it.
+    At a bounce a coordinate changes from approaching the nearest cushion to leaving it; contact with a soft cushion
+    counts once, however long it lasts. Coordinates beyond a cushion, also of a lost target, count as on it.
 
     Args:
-        positions: ``(T, 3)`` [m, world], one a control step, paths end to end.
+        positions: ``(T, 3)`` [m, world], one per control step, paths concatenated.
         start: ``(E,)`` index of each path's first sample, ascending from 0.
         half_extent: where the target's centre turns back, |x| or |y| [m]; None leaves paths as they are.
 
@@ -40,7 +40,7 @@ def unreflect_paths(positions: Tensor, start: Tensor, half_extent: float | None)
     if half_extent is None:
         return Lines(positions, torch.ones_like(level), torch.zeros_like(level))
     bounced = _bounces(level, start, half_extent)
-    # Bounces alternate between the two directions along the line, counted from each path's start.
+    # Bounces alternate between the two directions along the line, counted from the start of each path.
     count = bounced.to(torch.int32).cumsum(0, dtype=torch.int32)
     lengths = torch.diff(start, append=start.new_tensor([len(positions)]))
     count -= count[start].repeat_interleave(lengths, 0)

@@ -1,4 +1,4 @@
-"""How far forecasts and arrival times are off, on windows and runs that no network was fitted to."""
+"""Errors of forecasts and arrival times on held-out windows and runs."""
 
 from collections.abc import Mapping, Sequence
 from typing import Any
@@ -12,13 +12,13 @@ from torchdyn_plan.planners import Lost
 from torchdyn_plan.training.windows import Windows
 
 FAST = 0.004
-"""Motion from which a target is fast [m a step]."""
+"""Speed from which a target is fast [m a step]."""
 SHARES = (0.5, 0.8, 0.9, 0.95)
 """Probabilities of the intervals whose coverage is reported."""
 NEAR = 0.05
-"""Distance along both level axes within which a robot that waits has the target [m]."""
+"""Distance along both horizontal axes within which a waiting robot has the target [m]."""
 SOON = 30
-"""Arrivals within fewer control steps than this are scored on their own, too."""
+"""Arrivals within fewer control steps than this are also scored separately."""
 
 
 def forecast_errors(
@@ -26,9 +26,9 @@ def forecast_errors(
 ) -> list[dict[str, Any]]:
     """Distances between forecast and truth, with those of constant velocity for comparison.
 
-    Windows are scored by kind: ``full`` and ``padded`` histories of targets that move and are not lost, those of them
-    that are ``fast`` at the present, ``lost`` ones, scored while the target is not yet lost, and ``still`` ones, whose
-    target lies still.
+    Windows are scored by kind: ``full`` and ``padded`` histories of moving targets that are not lost; those of them
+    that are ``fast`` at the present; ``lost`` ones, scored until the target is lost; and ``still`` ones, whose target
+    rests.
 
     Args:
         forecast: ``(n, F, 3)`` [m, world], as cushions reflect it.
@@ -76,7 +76,7 @@ def coverage(
     fast: float = FAST,
     near: float = NEAR,
 ) -> list[dict[str, Any]]:
-    """How often errors lie within the intervals that should hold a share of them, axes pooled.
+    """Coverage: share of errors within the intervals of the spread, axes pooled.
 
     Args:
         forecast: ``(n, F, 3)`` [m, world].
@@ -84,12 +84,13 @@ def coverage(
         windows: of n targets, whose ``future`` is the path itself.
         ahead: control steps ahead that are scored, but for those beyond the horizon.
         fast: motion from which a target is fast [m a step].
-        near: distance along both level axes that is asked for [m].
+        near: distance along both horizontal axes [m].
 
     Returns:
         A row for each kind of window (as in `forecast_errors`) and each of ``ahead``: ``windows, ahead, count,
-        within_50, within_80, within_90, within_95`` shares of errors, the median ``half_width_90`` [m], and the mean
-        predicted probability ``near_predicted`` of being within ``near`` along both axes beside its share ``near``.
+        within_50, within_80, within_90, within_95`` shares of errors, the median ``half_width_90`` [m], the mean
+        predicted probability ``near_predicted`` of being within ``near`` along both axes, and its actual share
+        ``near``.
     """
     error = (forecast - windows.future)[..., :2].abs()
     rows = []
@@ -109,9 +110,9 @@ def coverage(
 
 
 def lost_probability(spread: Spread, windows: Windows, *, ahead: Sequence[int]) -> list[dict[str, Any]]:
-    """Predicted probability of being lost beside its share among moving targets, and its mean square error (Brier).
+    """Predicted probability of being lost and the actual share among moving targets, with the Brier score.
 
-    ``brier_share`` is that of predicting the share in every case.
+    ``brier_share`` is the score of predicting the share in every case.
     """
     rows = []
     for steps in (steps for steps in ahead if steps <= spread.gone.shape[-1]):
@@ -126,16 +127,16 @@ def lost_probability(spread: Spread, windows: Windows, *, ahead: Sequence[int]) 
 
 
 def lost_accuracy(forecast: Tensor, windows: Windows, lost: Lost) -> dict[str, Any]:
-    """How well the end of the forecast tells lost targets from the rest, among moving ones.
+    """How well the end of the forecast identifies lost targets among moving ones.
 
     Args:
         forecast: ``(n, F, 3)`` [m, world].
         windows: of n targets.
-        lost: when a forecast takes its target for lost.
+        lost: decides when a forecast target counts as lost.
 
     Returns:
-        ``count`` of windows, ``lost`` share of them, ``found`` share of the lost that are forecast so, and ``false``
-        share of the others that are forecast lost; shares are None where there are none.
+        ``count`` of windows, ``lost`` share of them, ``found`` share of the lost that are forecast lost, and ``false``
+        share of the others that are forecast lost; shares are None if there are none.
     """
     forecast_lost = lost.forecast(forecast[windows.moving, -1:]).squeeze(-1)
     truth = windows.lost[windows.moving]
@@ -162,7 +163,7 @@ def arrival_groups(arrival: Tensor, rest: Tensor | None = None) -> dict[str, Ten
 def arrival_errors(
     logits: Tensor, arrival: Tensor, groups: Mapping[str, Tensor], *, bin_width: int = 5
 ) -> list[dict[str, Any]]:
-    """Errors of arrival times where the robot arrives within the bins, and how often *never* is predicted rightly.
+    """Errors of arrival times if the robot arrives within the bins, and the accuracy of *never*.
 
     Args:
         logits: ``(n, bins + 1)``.

@@ -1,4 +1,4 @@
-"""Recorded paths as samples of windows, some of whose episodes no fit sees; and how recordings become shards."""
+"""Recorded paths as training and held-out windows, and the conversion of recordings to shards."""
 
 from __future__ import annotations
 
@@ -18,15 +18,15 @@ SCORED = 4096
 
 
 def lay_end_to_end(paths: Tensor, velocity: Tensor, lost: Tensor | None = None) -> dict[str, Tensor]:
-    """Paths of one length as a shard of data: each cut where its target is lost, one after the other.
+    """Paths of equal length as a data shard: each cut where its target is lost, then concatenated.
 
     Args:
-        paths: ``(M, T, 3)`` [m, world], a position a control step.
-        velocity: ``(M,)`` of each target, as the task counts it.
+        paths: ``(M, T, 3)`` [m, world], one position per control step.
+        velocity: ``(M,)`` of each target, as the task defines it.
         lost: ``(M, T)`` bool: whether a target is lost; None if none is.
 
     Returns:
-        ``positions start length pocketed velocity``, as `torchdyn_plan.tasks.Task.record_paths` says.
+        ``positions start length pocketed velocity``, see `torchdyn_plan.tasks.Task.record_paths`.
     """
     count, steps = paths.shape[:2]
     if lost is None:
@@ -40,7 +40,7 @@ def lay_end_to_end(paths: Tensor, velocity: Tensor, lost: Tensor | None = None) 
 
 @dataclass(frozen=True)
 class PathSamples:
-    """Paths whose episodes are split into those to fit to and those that are held out, one in ten."""
+    """Paths split into training and held-out episodes, one in ten held out."""
 
     paths: Paths
     last: Tensor
@@ -61,16 +61,16 @@ class PathSamples:
         return cls(paths, last, train, held, drawing)
 
     def draw(self, count: int, generator: torch.Generator, *, lines: Lines | None = None) -> Windows:
-        """``count`` random windows to fit to, their futures on ``lines`` if those are given."""
+        """``count`` random training windows, with futures on ``lines`` if given."""
         episodes = self.train[torch.randint(len(self.train), (count,), generator=generator)]
         return draw_windows(self.paths, self.last, episodes, self.drawing, generator, lines=lines)
 
     def regimes(self, seed: int) -> dict[str, Windows]:
-        """Held-out windows by what is told of them in the tables of scores: all of one kind here."""
+        """Held-out windows by their name in the tables of scores; here a single group."""
         return {"": self.held_windows(seed)}
 
     def held_windows(self, seed: int) -> Windows:
-        """`SCORED` windows with full histories and as many with padded ones, of episodes that are held out."""
+        """`SCORED` windows with full histories and as many with padded ones, from held-out episodes."""
         draws = torch.Generator().manual_seed(seed)
         full = replace(self.drawing, first_step=self.drawing.history, early_share=0.0, shortened_share=0.0)
         padded = replace(self.drawing, early_share=0.0, shortened_share=1.0)
@@ -82,7 +82,7 @@ class PathSamples:
 
 
 def _some(rows: Tensor, count: int) -> Tensor:
-    """``count`` of ``rows``, over and over if there are fewer."""
+    """``count`` of ``rows``, repeated if there are fewer."""
     if not len(rows):
         raise InputError("no held-out episode is long enough for a window: collect more episodes")
     return rows.repeat(-(-count // len(rows)))[:count]

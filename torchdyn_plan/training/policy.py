@@ -1,4 +1,4 @@
-"""Training of a policy: rounds of DDPG with scores, logs and checkpoints; it resumes exactly where it stopped."""
+"""Training of a policy: rounds of DDPG with scores, logs and checkpoints; resumes exactly."""
 
 from __future__ import annotations
 
@@ -48,21 +48,21 @@ def train_policy(
     """Train the policy ``name`` of ``task`` by its own recipe; returns the weights' file.
 
     Args:
-        task: whose policy.
+        task: the task.
         name: one of ``task.policies``.
-        out: as for `fit_policy`.
-        lr: the critic's learning rate, the actor's in the recipe's proportion; the recipe's own for None.
+        out: see `fit_policy`.
+        lr: the critic's learning rate, with the actor's in the recipe's proportion; the recipe's own for None.
         options: an instance of the `PolicyTraining.options`; the defaults for None.
         algorithm: one of `ALGORITHMS`; the recipe's own for None.
-        changes: fields of the recipe that are to be others; those that are None stay as they are.
-        resume: as for `fit_policy`, as are ``workers`` and ``device``.
+        changes: fields of the recipe to change; those that are None stay unchanged.
+        resume: see `fit_policy`, as for ``workers`` and ``device``.
         num_threads: of the simulation, 0 for all cores.
         workers: Ray workers.
         device: where networks learn.
 
     Raises:
-        InputError: there is no such policy, or its options are of another kind.
-        TrainingError: as `fit_policy` raises it.
+        InputError: there is no such policy, or the options have the wrong type.
+        TrainingError: see `fit_policy`.
     """
     check_choice(f"policy of {task.name}", name, task.policies)
     training = task.policies[name]
@@ -101,18 +101,18 @@ def fit_policy(
     workers: int = 0,
     device: str = "cpu",
 ) -> Path:
-    """Train a policy for ``task`` by `DDPG`; the best that was scored is kept.
+    """Train a policy for ``task`` by `DDPG`; the one with the best score is kept.
 
-    Killed at any moment and resumed, it ends where it would have without: rounds are whole episodes of every
-    environment, and networks, optimisers, replay, counters and random states are in the checkpoint.
+    A run that is killed at any time and resumed gives the same result as an uninterrupted one: rounds are whole
+    episodes of every environment, and networks, optimisers, replay, counters and random states are in the checkpoint.
 
     Args:
         task: goals, rewards and score.
         out: gets a folder ``name`` with checkpoint, ``curve.csv``, TensorBoard's files, weights and card.
-        name: of the folder.
+        name: name of the folder.
         recipe: rounds, rates and seed.
         resume: whether to continue from the checkpoint in ``out``.
-        score_every: rounds from one score to the next.
+        score_every: rounds between scores.
         checkpoint_seconds: time between checkpoints [s].
         workers: Ray workers that run the episodes; 0 runs them here.
         device: where networks learn; the simulation stays on the CPU.
@@ -124,7 +124,7 @@ def fit_policy(
         TrainingError: a loss is NaN, or the checkpoint is damaged, of another task, or has other settings.
     """
     check_number("score_every", score_every, minimum=1, integer=True)
-    # TorchRL logs every storage that it makes, which breaks the progress bar.
+    # TorchRL logs every storage it makes, which breaks the progress bar.
     logging.getLogger("torchrl").setLevel(logging.WARNING)
     recipe = recipe or DDPGRecipe()
     with one_thread():
@@ -133,7 +133,7 @@ def fit_policy(
 
 
 class Learner(TypedDict):
-    """Where `DDPG` stands."""
+    """Progress of `DDPG`."""
 
     iteration: Count
     cursor: Count
@@ -141,7 +141,7 @@ class Learner(TypedDict):
 
 
 class Progress(TypedDict):
-    """State of a training, apart from its tensors."""
+    """State of a training, without its tensors."""
 
     curve: list[dict[str, float]]
     best: dict[str, float]
@@ -202,7 +202,7 @@ class _Training:
         return on_cluster(kind)(self.task, self.recipe, workers=self.workers, device=self.device)
 
     def score(self, figures: dict[str, float], log: _TensorBoard) -> dict[str, float]:
-        """Score the policy, add a row to the curve, and keep the policy if there was none better."""
+        """Score the policy, add a row to the curve, and keep the policy if it is the best so far."""
         transitions = self.ddpg.iteration * self.recipe.num_envs * self.task.length
         with torch.random.fork_rng(devices=[]), torch.no_grad():
             score = self.task.score(copy.deepcopy(self.ddpg.learned).cpu())
@@ -245,7 +245,7 @@ def _rank(score: dict[str, float]) -> tuple[float, float]:
 
 
 def write_curve(file: Path, curve: list[dict[str, float]]) -> None:
-    """Write rows of figures as CSV, whole or not at all; the columns are those of the last row."""
+    """Write rows of figures as CSV, atomically; the columns are those of the last row."""
     text = io.StringIO()
     table = csv.DictWriter(text, fieldnames=list(curve[-1]), restval="", extrasaction="ignore")
     table.writeheader()
@@ -254,7 +254,7 @@ def write_curve(file: Path, curve: list[dict[str, float]]) -> None:
 
 
 class _TensorBoard:
-    """TensorBoard's log, where the library is installed."""
+    """TensorBoard's log, if the library is installed."""
 
     def __init__(self, folder: Path, step: int) -> None:
         try:
@@ -262,7 +262,7 @@ class _TensorBoard:
 
             self.writer = SummaryWriter(str(folder), purge_step=step)
         except (ImportError, OSError):
-            # A log is no reason to fail, on a full disk neither.
+            # A failing log, for example on a full disk, does not end the training.
             self.writer = None
 
     def add(self, figures: dict[str, float], step: int) -> None:

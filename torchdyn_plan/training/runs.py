@@ -1,4 +1,4 @@
-"""Runs of a static planner from goal to goal, and what they teach about arrival times."""
+"""Runs of a static planner from goal to goal, as training data for arrival times."""
 
 from __future__ import annotations
 
@@ -22,16 +22,16 @@ class Runner(Protocol):
 
     @property
     def robot_state(self) -> Tensor:
-        """What an ETA network reads, ``(N, S)``."""
+        """Input of an ETA network, ``(N, S)``."""
         ...
 
     @property
     def tool_pos(self) -> Tensor:
-        """Where the tools are, ``(N, 3)`` [m, world]."""
+        """Tool positions, ``(N, 3)`` [m, world]."""
         ...
 
     def reset(self) -> None:
-        """Put every robot at its start."""
+        """Put every robot at its start pose."""
         ...
 
     def is_reached(self, goal: Tensor) -> Tensor:
@@ -48,25 +48,25 @@ class RunPlan:
     """How runs follow one another; times are control steps."""
 
     goals: Callable[[int, torch.Generator], Tensor]
-    """Draws so many goals, ``(count, 3)`` [m, world]."""
+    """Draws the given number of goals, ``(count, 3)`` [m, world]."""
     sequence: int
-    """Length of a sequence of runs, which begins at the start."""
+    """Length of a sequence of runs, which begins at the start pose."""
     longest: int
-    """A run that has neither arrived nor come to rest by then is given up."""
+    """A run that has neither arrived nor come to rest by then is abandoned."""
     redirected_within: int
-    """A run that is redirected is so by then."""
+    """Latest time at which a run is redirected."""
     at_rest: Callable[[Tensor], Tensor] | None = None
     """Which robot states (N, S) are at rest, ``(N,)``: a robot that comes to rest elsewhere than at its goal never
-    arrives. None if states do not tell."""
+    arrives. None if this cannot be read from the state."""
     starting: int = 0
-    """By then a new goal has set a robot in motion."""
+    """Time by which a new goal has set a robot in motion."""
     redirected: float = 0.35
-    """Share of runs that are given another goal on their way, and teach nothing themselves."""
+    """Share of runs that get another goal on their way; these give no samples."""
     states: int = STATES_PER_RUN
     """Samples taken from each run."""
     comes_to_rest: bool = True
-    """The robot comes to rest where it cannot get nearer to its goal: a run that is given up before teaches nothing.
-    Otherwise such a run never arrives."""
+    """Whether the robot comes to rest where it cannot get nearer to its goal: then an abandoned run gives no samples.
+    Otherwise such a run counts as never arriving."""
 
     def __post_init__(self) -> None:
         for name in ("sequence", "longest", "redirected_within", "states"):
@@ -77,9 +77,9 @@ class RunPlan:
 
 
 def record_runs(runner: Runner, plan: RunPlan, *, sequences: int, seed: int) -> dict[str, Tensor]:
-    """So many sequences of runs of every robot, one after the other; arguments and result as of `record_sequence`.
+    """``sequences`` sequences of runs of every robot, one after another; see `record_sequence`.
 
-    ``seed`` is of every draw.
+    ``seed`` determines every draw.
     """
     draw = torch.Generator().manual_seed(seed)
     parts = [record_sequence(runner, plan, draw) for _ in range(sequences)]
@@ -97,7 +97,7 @@ def record_sequence(runner: Runner, plan: RunPlan, draw: torch.Generator) -> dic
     Returns:
         n samples, ``plan.states`` of each run, the first at its start: ``robot_state`` (n, S), ``goal`` (n, 3)
         [m, world], ``arrival`` (n,) control steps from the state to the goal or -1 for never, ``nearest`` (n,) control
-        steps until the tool was as near to the goal as it came, ``run`` (n,) numbers.
+        steps until the tool was nearest to the goal, ``run`` (n,) numbers.
     """
     runner.reset()
     count, size = runner.robot_state.shape
@@ -131,7 +131,7 @@ def record_sequence(runner: Runner, plan: RunPlan, draw: torch.Generator) -> dic
             )
             goal[rows], given[rows] = plan.goals(len(rows), draw), step
             turning[rows] = _turning(plan, len(rows), draw)
-        # A goal's tensor belongs to the planner's memory from here on.
+        # From here on the goal's tensor belongs to the planner's memory.
         runner.step(goal.clone())
     whole = {name: torch.cat([sample[name] for sample in samples]) for name in samples[0]}
     whole["run"] = torch.arange(len(whole["goal"])) // plan.states + torch.randint(2**40, (1,), generator=draw)
@@ -139,12 +139,12 @@ def record_sequence(runner: Runner, plan: RunPlan, draw: torch.Generator) -> dic
 
 
 def first_as_near(tool_pos: Tensor, goal: Tensor, given: Tensor | None = None) -> Tensor:
-    """First step ``(M,)`` at which tools are within `AS_NEAR` of the place nearest to their goals that they come to.
+    """First step ``(M,)`` at which tools are within `AS_NEAR` of their closest approach to the goal.
 
     Args:
         tool_pos: ``(T, M, 3)`` at steps 0 … T-1 [m, world].
         goal: ``(M, 3)`` [m, world].
-        given: ``(M,)`` step from which on places count; all for None.
+        given: ``(M,)`` first step considered; 0 for None.
     """
     away = (tool_pos - goal).norm(dim=-1)
     before = torch.zeros_like(away, dtype=torch.bool)

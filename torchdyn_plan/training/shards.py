@@ -1,4 +1,4 @@
-"""Collected data in a folder: shards, and the descriptions that they are held against."""
+"""Collected data in a folder: shards, and the descriptions that they are checked against."""
 
 from __future__ import annotations
 
@@ -14,21 +14,21 @@ from torchdyn_plan.files import files_in, read_json, read_metadata, read_tensors
 from torchdyn_plan.schemas import Count, Positive, check_content
 
 SHARD = {"paths": 1024, "arrivals": 2048}
-"""Episodes in a shard of each kind of data; of arrivals, sequences of runs."""
+"""Episodes in a shard of paths, and sequences of runs in a shard of arrivals."""
 
 
 class Arguments(TypedDict):
-    """What is read back of what a collection was asked for."""
+    """Arguments of a collection that are read back."""
 
     episodes: Positive
     seed: Count
     num_envs: Positive
     static: str
-    """Whose arrivals they are; of paths it says nothing."""
+    """Static planner of the arrivals; unused for paths."""
 
 
 class Description(TypedDict):
-    """What is read back of the description of a collection."""
+    """Content of a collection's description that is read back."""
 
     arguments: Arguments
     scene: str
@@ -40,22 +40,22 @@ def shard_path(folder: Path, stem: str, seed: int, index: int) -> Path:
 
 
 def shard_sizes(stem: str, episodes: int) -> list[int]:
-    """Episodes of each shard of so many ``episodes``."""
+    """Number of episodes in each shard, for ``episodes`` in total."""
     size = SHARD[stem]
     return [min(size, episodes - first) for first in range(0, episodes, size)]
 
 
 def surplus_shards(folder: Path, stem: str, seed: int, count: int) -> list[Path]:
-    """Shards of series ``seed`` in ``folder`` that are none of its first ``count``."""
+    """Shards of series ``seed`` in ``folder`` beyond its first ``count``."""
     known = {shard_path(folder, stem, seed, index) for index in range(count)}
     return sorted(set(files_in(folder, f"{stem}-{seed}-*.safetensors")) - known)
 
 
 def read_description(data: Path, stem: str, *, scene: str) -> dict[str, Any]:
-    """What ``data`` says of its ``stem-*.safetensors``.
+    """Description of the ``stem-*.safetensors`` in ``data``.
 
-    These are ``data``, the arguments of each collection, ``scene``, and of arrivals ``static`` and, if it is a policy
-    of weights that were given, their digest as ``weights``.
+    It has ``data``, the arguments of each collection; ``scene``; and for arrivals ``static`` and, for a policy with
+    given weights, their digest as ``weights``.
 
     Args:
         data: folder of `torchdyn_plan.training.collect`.
@@ -63,8 +63,8 @@ def read_description(data: Path, stem: str, *, scene: str) -> dict[str, Any]:
         scene: digest of the scene that the data must come from.
 
     Raises:
-        InputError: there is no description, it is broken, tells of another scene or of another static planner than
-            the next, or the shards are not those that it tells of.
+        InputError: there is no description, it is broken, is of another scene, descriptions are of different static
+            planners, or the shards do not match their description.
     """
     data = Path(data)
     files = files_in(data, f"{stem}-*.json")
@@ -74,10 +74,10 @@ def read_description(data: Path, stem: str, *, scene: str) -> dict[str, Any]:
     described: dict[Path, dict[str, str]] = {}
     for file in files:
         content = read_json(file)
-        about: Description = check_content(content, Description, f"{short_path(file)} is no description of data")
+        about: Description = check_content(content, Description, f"{short_path(file)} is not a description of data")
         if about["scene"] != scene:
             raise InputError(
-                f"{short_path(file)} tells of scene {about['scene']}, but the scene is {scene}: collect the data again"
+                f"{short_path(file)} is of scene {about['scene']}, but the scene is {scene}: collect the data again"
             )
         series = f"{stem}-{about['arguments']['seed']}.json"
         if file.name != series:
@@ -106,7 +106,7 @@ def read_shards(folder: Path, stem: str, names: Sequence[str]) -> list[dict[str,
         if missing:
             raise InputError(f"{short_path(file)} lacks {', '.join(missing)}")
         if made.get("content", content := content_digest(shard)) != content:
-            raise InputError(f"{short_path(file)} is damaged: it holds something else than was written")
+            raise InputError(f"{short_path(file)} is damaged: it differs from what was written")
         if "length" in names and made.get("episodes", str(len(shard["length"]))) != str(len(shard["length"])):
             raise InputError(f"{short_path(file)} says {made['episodes']} episodes and has {len(shard['length'])}")
         shards.append(shard)
@@ -114,7 +114,7 @@ def read_shards(folder: Path, stem: str, names: Sequence[str]) -> list[dict[str,
 
 
 def content_digest(tensors: Mapping[str, Tensor]) -> str:
-    """A few letters that tell the contents of shards apart."""
+    """A short digest of a shard's content."""
     told = hashlib.sha256()
     for name, tensor in sorted(tensors.items()):
         told.update(f"{name} {tensor.dtype} {tuple(tensor.shape)} ".encode())
@@ -123,10 +123,10 @@ def content_digest(tensors: Mapping[str, Tensor]) -> str:
 
 
 def check_made(path: Path, made: dict[str, str]) -> list[str]:
-    """What differs between how the shard at ``path`` was made, by its own word, and ``made``; it must tell all of it.
+    """Differences between the metadata of the shard at ``path`` and ``made``; the metadata must be complete.
 
     Raises:
-        InputError: the shard is damaged, or was made otherwise in anything but the number of its ``episodes``.
+        InputError: the shard is damaged, or differs in more than the number of its ``episodes``.
     """
     there = _read_made(path)
     told = {**made, **dict.fromkeys(_DECISIVE & there.keys())}
@@ -140,11 +140,11 @@ def check_made(path: Path, made: dict[str, str]) -> list[str]:
 
 
 _DECISIVE = {"scene", "num_envs", "episodes", "static", "weights"}
-"""What decides a shard's numbers, beside its name."""
+"""Metadata that, together with its name, determines a shard's numbers."""
 
 
 def _read_made(path: Path) -> dict[str, str]:
-    """How the shard at ``path`` was made, by its own word; raises `InputError` where it is another one by that word."""
+    """Metadata of the shard at ``path``; raises `InputError` if it names another shard."""
     there = read_metadata(path, InputError)
     if there.get("shard", path.stem) != path.stem:
         raise InputError(f"{short_path(path)} is the shard {there['shard']} under another name: delete it")
@@ -152,7 +152,7 @@ def _read_made(path: Path) -> dict[str, str]:
 
 
 def _check_shards(data: Path, stem: str, about: Description) -> dict[Path, dict[str, str]]:
-    """Shards that a description tells of, and what they tell; raises `InputError` where one is missing or another."""
+    """Shards of a description, and their metadata; raises `InputError` if one is missing or different."""
     asked = about["arguments"]
     found: dict[Path, dict[str, str]] = {}
     for index, episodes in enumerate(shard_sizes(stem, asked["episodes"])):
@@ -171,7 +171,7 @@ def _check_shards(data: Path, stem: str, about: Description) -> dict[Path, dict[
 
 
 def _check_alike(described: dict[Path, dict[str, str]]) -> None:
-    """Raise `InputError` if shards are of the arrivals of several static planners."""
+    """Raise `InputError` if the shards' arrivals are of several static planners."""
     first = next(iter(described.values()))
     for path, there in described.items():
         if _driver(there) != _driver(first):
@@ -182,7 +182,7 @@ def _check_alike(described: dict[Path, dict[str, str]]) -> None:
 
 
 def _driver(made: dict[str, str]) -> dict[str, str]:
-    """Which static planner was driven, by a shard's own word; nothing for paths."""
+    """Static planner of a shard, from its metadata; empty for paths."""
     return {name: made[name] for name in ("static", "weights") if name in made}
 
 

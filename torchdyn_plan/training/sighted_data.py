@@ -1,4 +1,4 @@
-"""Recorded paths as samples of windows that a track shows a forecaster, from sensors of many kinds."""
+"""Recorded paths as training windows for a forecaster behind a track, with many simulated sensors."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from torchdyn_plan.training.sightings import SensorRange, Sightings, record_sigh
 from torchdyn_plan.training.windows import Paths, WindowConfig, Windows
 
 LOOK_BACK = 25
-"""A track that heads the other way than its target does not know of a bounce of so many control steps ago or less."""
+"""A track that moves opposite to its target has missed a bounce within this many control steps."""
 REGIMES = {
     "exact": Sensor(),
     "2 mm, 250 Hz": Sensor(noise=0.002),
@@ -26,27 +26,27 @@ REGIMES = {
     "5 mm, 30 Hz, 5 % lost, 3 ms jitter": Sensor(noise=0.005, rate=30.0, dropout=0.05, jitter=0.003),
     "8 mm, 30 Hz, 40 ms late": Sensor(noise=0.008, rate=30.0, latency=0.04),
 }
-"""Sensors at which forecasts and their spread are scored, by name."""
+"""Sensors for which forecasts and their spread are scored, by name."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class Sighting:
-    """How a forecaster that sees by a track is trained."""
+    """How a forecaster behind a track is trained."""
 
     track: Callable[[], Track] = KalmanTrack
-    """Makes the track that the planner will see by; it is told each sensor's noise."""
+    """Makes the planner's track; its noise is set to each sensor's."""
     sensors: SensorRange = field(default_factory=SensorRange)
-    """Of the recorded paths."""
+    """Range of the sensors that measure the recorded paths."""
     regimes: Mapping[str, Sensor] = field(default_factory=lambda: dict(REGIMES))
-    """Sensors at which it is scored, by name."""
+    """Sensors for which it is scored, by name."""
     least_noise: float = 1e-4
-    """A track takes no measurement for better than this [m]."""
+    """Lower bound on a track's noise [m]."""
     steps: int = 500
-    """No target is seen later than this [control steps since its reset]."""
+    """Latest step used of a path [control steps since its reset]."""
     passes: int = 4
-    """Sensors that each path is measured by."""
+    """Number of sensors that measure each path."""
     each: int = 32
-    """Moments at which a track's knowledge of a path is kept, of each pass."""
+    """Number of track states kept of a path, in each pass."""
 
     def __post_init__(self) -> None:
         check_number("least_noise", self.least_noise, minimum=1e-6)
@@ -56,11 +56,11 @@ class Sighting:
 
 @dataclass(frozen=True)
 class SightedSamples:
-    """Sightings of the paths to fit to, and the paths; as `PathSamples`."""
+    """Sightings of the training paths, and the paths; with the interface of `PathSamples`."""
 
     samples: PathSamples
     sightings: Sightings
-    """Of the paths to fit to."""
+    """Sightings of the training paths."""
     sighting: Sighting
     control_step: float
     """[s]."""
@@ -69,7 +69,7 @@ class SightedSamples:
     def load(
         cls, folder: Path, drawing: WindowConfig, seed: int, sighting: Sighting, *, control_step: float
     ) -> SightedSamples:
-        """The paths in ``folder``, measured and followed; ``seed`` is of every draw. Raises `InputError`."""
+        """The paths in ``folder``, measured and tracked; ``seed`` determines every draw. Raises `InputError`."""
         samples = PathSamples.load(folder, drawing, seed)
         draws = torch.Generator().manual_seed(seed)
         episodes = samples.train.repeat(sighting.passes)
@@ -94,7 +94,7 @@ class SightedSamples:
     def record(
         self, episodes: Tensor, sensors: SensorRange | Sensor, each: int, generator: torch.Generator
     ) -> Sightings:
-        """``each`` sightings of every one of ``episodes`` (M,) by a sensor of its own, or by that one."""
+        """``each`` sightings of every one of ``episodes`` (M,), each with its own sensor, or all with one."""
         return record_sightings(
             self.paths,
             self.samples.last,
@@ -109,7 +109,7 @@ class SightedSamples:
         )
 
     def draw(self, count: int, generator: torch.Generator, *, lines: Lines | None = None) -> Windows:
-        """``count`` random windows to fit to, their futures on ``lines`` if those are given."""
+        """``count`` random training windows, with futures on ``lines`` if given."""
         rows = torch.randint(len(self.sightings.episode), (count,), generator=generator)
         return self.windows(self.sightings.take(rows), lines=lines)
 
@@ -128,7 +128,7 @@ class SightedSamples:
         return found
 
     def windows(self, seen: Sightings, *, lines: Lines | None = None) -> Windows:
-        """Windows of the targets that are ``seen``, their futures on ``lines`` if those are given."""
+        """Windows of the targets ``seen``, with futures on ``lines`` if given."""
         paths, config = self.paths, self.drawing
         first, last = paths.start[seen.episode], paths.length[seen.episode] - 1
         ahead = torch.arange(1, config.horizon + 1) + seen.present.unsqueeze(-1)
@@ -157,19 +157,19 @@ class SightedSamples:
 
 
 def stretch_of(lines: Lines, now: Tensor, back: Tensor, history: Tensor) -> tuple[Tensor, Tensor]:
-    """The side and the shift, ``(n, 2)`` each, of the stretch of table from which a track sees its target's line.
+    """Side and shift, ``(n, 2)`` each, of the stretch of table on which a track places its target.
 
-    That is where the target is, but along an axis in which the target has bounced and the track does not know of it
-    yet: there it is where the target was.
+    This is the target's own stretch, except along an axis in which it has bounced without the track showing it yet:
+    there it is the stretch before the bounce.
 
     Args:
-        lines: of all paths.
+        lines: lines of all paths.
         now: ``(n,)`` index of each target's present.
         back: ``(n,)`` how many samples ago it may have bounced.
-        history: ``(n, H, 3)`` positions by the track [m, world].
+        history: ``(n, H, 3)`` positions according to the track [m, world].
     """
     before, heading = now - back, history[:, -1, :2] - history[:, -2, :2]
-    # The line runs on in one direction; seen from a stretch it goes there times the side.
+    # The line runs on in one direction; on a stretch its direction is multiplied by the side.
     runs = lines.track[now, :2] - lines.track[before, :2]
     unaware = (lines.side[now] != lines.side[before]) & (heading * runs * lines.side[before] > 0.0)
     side = torch.where(unaware, lines.side[before], lines.side[now])

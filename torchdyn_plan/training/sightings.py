@@ -1,4 +1,4 @@
-"""Recorded paths as a planner sees them: measured by sensors of many kinds, and followed by its track."""
+"""Recorded paths as a planner sees them: measured by simulated sensors, and tracked."""
 
 from __future__ import annotations
 
@@ -16,13 +16,13 @@ from torchdyn_plan.planners.track import Track, TrackState
 from torchdyn_plan.training.windows import Paths
 
 BLOCK = 2048
-"""Paths that are followed at once."""
+"""Paths tracked at once."""
 NEVER = -1
-"""Control step at which a lost measurement is seen."""
+"""Arrival step of a lost measurement."""
 
 
 class SensorRows(NamedTuple):
-    """A sensor for each of M paths, as `torchdyn_plan.envs.Sensor` describes one."""
+    """A sensor for each of M paths, with the settings of `torchdyn_plan.envs.Sensor`."""
 
     noise: Tensor
     """``(M,)`` [m]."""
@@ -33,11 +33,11 @@ class SensorRows(NamedTuple):
     jitter: Tensor
     """``(M,)`` [s]."""
     dropout: Tensor
-    """``(M,)`` share of the measurements that are lost."""
+    """``(M,)`` share of lost measurements."""
 
     @classmethod
     def of(cls, sensor: Sensor, count: int, control_step: float) -> SensorRows:
-        """The same ``sensor`` for ``count`` paths; raises `InputError` for one that rounds."""
+        """The same ``sensor`` for ``count`` paths; raises `InputError` if it quantises."""
         if sensor.quantisation:
             raise InputError(f"paths are measured without quantisation, got {sensor.quantisation:g} m")
         values = (sensor.noise, sensor.rate or 1.0 / control_step, sensor.latency, sensor.jitter, sensor.dropout)
@@ -46,22 +46,22 @@ class SensorRows(NamedTuple):
 
 @dataclass(frozen=True, kw_only=True)
 class SensorRange:
-    """Sensors that a forecaster is trained for; one is drawn for each path."""
+    """Range of sensors that a forecaster is trained for; one sensor is drawn for each path."""
 
     noise: float = 0.008
     """Largest standard deviation of a measurement's error along each axis [m]; smaller ones are likelier."""
     slowest: float = 30.0
-    """Fewest measurements a second [Hz]."""
+    """Lowest rate [Hz]."""
     fastest: float = 250.0
-    """Most measurements a second [Hz]."""
+    """Highest rate [Hz]."""
     latency: float = 0.04
-    """Longest time from a measurement to when it is seen [s]."""
+    """Longest time from a measurement to its arrival [s]."""
     jitter: float = 0.004
-    """Largest standard deviation of the moments of measurements, and at most a fifth of the time between two [s]."""
+    """Largest standard deviation of measurement times, at most a fifth of the time between two [s]."""
     dropout: float = 0.1
-    """Largest share of measurements that are lost."""
+    """Largest share of lost measurements."""
     plain: float = 0.25
-    """Share of the sensors that are neither late, nor irregular, nor lose anything."""
+    """Share of sensors without latency, jitter and dropout."""
 
     def __post_init__(self) -> None:
         for name in ("noise", "latency", "jitter"):
@@ -72,7 +72,7 @@ class SensorRange:
             check_number(name, getattr(self, name), minimum=0.0, maximum=1.0)
 
     def draw(self, count: int, generator: torch.Generator) -> SensorRows:
-        """``count`` sensors: noise dense near 0, rates even in their logarithm, everything else even."""
+        """``count`` sensors: noise denser near 0, rates log-uniform, everything else uniform."""
         noise, rate, latency, jitter, dropout, kind = torch.rand((6, count), generator=generator)
         rate = self.slowest * (self.fastest / self.slowest) ** rate
         real = (kind >= self.plain).float()
@@ -86,39 +86,39 @@ class SensorRange:
 
 
 class Measured(NamedTuple):
-    """What is seen of M targets at each of T control steps: one measurement at most, the newest that comes."""
+    """Measurements of M targets at each of T control steps: at most one, the newest that arrives."""
 
     time: Tensor
-    """``(M, T)`` when it was taken; NaN for none [s since the reset]."""
+    """``(M, T)`` time stamp; NaN for none [s since the reset]."""
     pos: Tensor
     """``(M, T, 3)`` [m, world]."""
 
 
 class Sightings(NamedTuple):
-    """What a track knows of n targets at moments at which it is of use."""
+    """States of a track for n targets, at times at which it is usable."""
 
     episode: Tensor
-    """``(n,)`` int64 path that each is of."""
+    """``(n,)`` int64 index of the path."""
     present: Tensor
-    """``(n,)`` int64 control step at which it is seen."""
+    """``(n,)`` int64 control step."""
     state: TrackState
-    """``(n, …)`` what is known then."""
+    """``(n, …)`` state of the track."""
     covariance: Tensor
-    """``(n, 2, 2)`` of position and velocity along each axis at that moment [m², m²/s; m²/s, m²/s²]."""
+    """``(n, 2, 2)`` of position and velocity along each axis at that step [m², m²/s; m²/s, m²/s²]."""
 
     def history(self, length: int, control_step: float) -> Tensor:
-        """Positions ``(n, H, 3)`` at the last ``length`` control steps, as the track has them [m, world]."""
+        """Positions ``(n, H, 3)`` at the last ``length`` control steps, according to the track [m, world]."""
         ago = torch.arange(1 - length, 1)
         return self.state.path(control_step * (self.present.unsqueeze(-1) + ago).to(self.state.motion.dtype))
 
     def take(self, rows: Tensor) -> Sightings:
-        """Those of ``rows``."""
+        """The sightings ``rows``."""
         state = TrackState(*(value[rows] for value in self.state))
         return Sightings(self.episode[rows], self.present[rows], state, self.covariance[rows])
 
     @classmethod
     def joined(cls, parts: Sequence[Sightings]) -> Sightings:
-        """All of them, one after the other."""
+        """Concatenate them."""
         states = zip(*(part.state for part in parts), strict=True)
         state = TrackState(*(torch.cat(values) for values in states))
         episode, present, covariance = (
@@ -130,17 +130,17 @@ class Sightings(NamedTuple):
 def measure(
     paths: Paths, episodes: Tensor, sensors: SensorRows, steps: int, *, control_step: float, generator: torch.Generator
 ) -> Measured:
-    """Measurements of the paths of ``episodes`` (M,), that can be seen at control steps 0 … ``steps``.
+    """Measurements of the paths of ``episodes`` (M,) that arrive at control steps 0 … ``steps``.
 
-    Of several that come with one control step the newest counts. A target that is lost stays where it was lost.
+    If several arrive at one control step, the newest is used. A lost target stays where it was lost.
 
     Args:
-        paths: recorded, a position a control step.
+        paths: recorded paths, one position per control step.
         episodes: ``(M,)`` int64.
-        sensors: of each path.
+        sensors: a sensor for each path.
         steps: last control step.
         control_step: [s].
-        generator: of all errors and losses.
+        generator: source of all errors and losses.
     """
     period = 1.0 / sensors.rate.double()
     count = int(steps * control_step * float(sensors.rate.max()) + 1e-9) + 1
@@ -149,7 +149,7 @@ def measure(
     taken = (torch.arange(count) * period.unsqueeze(-1) + chance * sensors.jitter.unsqueeze(-1)).clamp_min(0.0)
     lost = torch.rand(shape, generator=generator) < sensors.dropout.unsqueeze(-1)
     error = torch.randn((*shape, 3), generator=generator) * sensors.noise[:, None, None]
-    # The first one is there at the reset, and never lost.
+    # The first one is available at the reset, and never lost.
     taken[:, 0], lost[:, 0] = 0.0, False
     seen = torch.ceil((taken + sensors.latency.unsqueeze(-1)) / control_step - 1e-9).long()
     seen[:, 0] = 0
@@ -169,7 +169,7 @@ def measure(
 
 
 def _places(paths: Paths, episodes: Tensor, when: Tensor) -> Tensor:
-    """Positions ``(M, K, 3)`` [m, world] of ``episodes`` (M,) at moments ``when`` (M, K) [control steps]."""
+    """Positions ``(M, K, 3)`` [m, world] of ``episodes`` (M,) at times ``when`` (M, K) [control steps]."""
     before = when.floor().long()
     first, last = paths.start[episodes].unsqueeze(-1), (paths.length[episodes] - 1).unsqueeze(-1)
     old, new = (paths.positions[first + torch.minimum(before + more, last)] for more in (0, 1))
@@ -179,18 +179,18 @@ def _places(paths: Paths, episodes: Tensor, when: Tensor) -> Tensor:
 def follow(
     track: Track, measured: Measured, sensors: SensorRows, *, control_step: float, least_noise: float
 ) -> tuple[TrackState, Tensor, Tensor]:
-    """What ``track`` knows at every control step, as it does in a loop.
+    """Run ``track`` over all control steps, as in a control loop.
 
     Args:
-        track: that the planner uses; told each sensor's noise, but no less than ``least_noise`` [m].
-        measured: of M targets at T control steps.
-        sensors: that measured them.
+        track: the planner's track; its noise is set to each sensor's, but at least to ``least_noise`` [m].
+        measured: measurements of M targets at T control steps.
+        sensors: the sensors that took them.
         control_step: [s].
-        least_noise: as above.
+        least_noise: see above.
 
     Returns:
         The states ``(M, T, …)``, the covariance ``(M, T, 2, 2)`` of position and velocity at each step, and whether the
-        track is of use then ``(M, T)`` bool.
+        track is usable ``(M, T)`` bool.
     """
     variance = sensors.noise.clamp_min(least_noise).square()
     state, found = track.start(measured.pos[:, 0]), []
@@ -215,19 +215,19 @@ def record_sightings(
     least_noise: float,
     generator: torch.Generator,
 ) -> Sightings:
-    """``each`` sightings of every one of ``episodes`` (M,), at random control steps, but where the track is of no use.
+    """``each`` sightings of every one of ``episodes`` (M,), at random control steps at which the track is usable.
 
     Args:
-        paths: recorded.
-        last_step: ``(E,)`` latest step at which each path is seen.
+        paths: recorded paths.
+        last_step: ``(E,)`` latest step used of each path.
         episodes: ``(M,)`` int64.
-        track: that the planner uses.
-        sensors: range from which each path's sensor is drawn, or that of all.
-        steps: no later step is seen.
-        each: sightings of a path.
+        track: the planner's track.
+        sensors: range from which each path's sensor is drawn, or one sensor for all.
+        steps: latest step used of any path.
+        each: number of sightings of a path.
         control_step: [s].
-        least_noise: as of `follow`.
-        generator: of every draw.
+        least_noise: see `follow`.
+        generator: source of every draw.
     """
     parts = []
     for block in episodes.split(BLOCK):
@@ -240,7 +240,7 @@ def record_sightings(
         state, covariance, usable = follow(track, measured, drawn, control_step=control_step, least_noise=least_noise)
         last = last_step[block].clamp(min=0, max=steps).unsqueeze(-1)
         chance = torch.rand((len(block), each), generator=generator)
-        # Squared: presents lie denser where targets are still fast.
+        # Squared, so that presents are denser while targets are still fast.
         present = (chance.square() * (last + 1)).long()
         row = torch.arange(len(block)).unsqueeze(-1).expand_as(present)
         kept = usable[row, present] & (present <= last)

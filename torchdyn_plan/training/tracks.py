@@ -1,4 +1,4 @@
-"""A person's own recordings of targets: read from a file, and brought to a task's control steps."""
+"""Your own recordings of targets: read from a file, and resampled to a task's control steps."""
 
 from __future__ import annotations
 
@@ -23,46 +23,46 @@ COLUMNS = {
     "z": ("z",),
     "track": ("track", "track_id", "id"),
 }
-"""Columns of a recording, and what they may be called; ``z`` and ``track`` may be absent."""
+"""Columns of a recording and their accepted names; ``z`` and ``track`` may be absent."""
 NEEDED = ("time", "x", "y")
 GAP = 5.0
-"""Between two samples that lie more than so many usual intervals apart a track is cut in two."""
+"""A track is split where two samples are more than this many usual intervals apart."""
 FARTHEST = 1e6
-"""No place is farther from the origin [m]."""
+"""Largest allowed distance from the origin [m]."""
 MOST = 50_000_000
-"""Samples at control steps at most: tracks that give more have their time in other units than seconds."""
+"""Most samples after resampling: with more, the time is probably not in seconds."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class Tracks:
-    """Tracks of targets as they were recorded, ``n`` samples in the order of the file."""
+    """Recorded tracks of targets, ``n`` samples in the order of the file."""
 
     time: np.ndarray[Any, Any]
     """``(n,)`` [s]."""
     place: np.ndarray[Any, Any]
     """``(n, 3)`` [m, world]; height 0 where the file has none."""
     track: np.ndarray[Any, Any]
-    """``(n,)`` number of the track that each sample is of."""
+    """``(n,)`` number of each sample's track."""
     rows: np.ndarray[Any, Any]
-    """``(n,)`` row of the file that it stands in."""
+    """``(n,)`` row of each sample in the file."""
     file: Path
-    """Where they come from."""
+    """The file."""
 
     def rest(self, name: str, index: int) -> str:
-        """Which entry of the file a message is about."""
+        """The file, row and column of an entry, for messages."""
         return f"{short_path(self.file)}, row {self.rows[index]}, column {name}"
 
 
 def read_tracks(file: Path) -> Tracks:
     """The tracks in ``file``, ``.csv``, ``.parquet``, ``.npy`` or ``.npz``.
 
-    Columns are time [s], x, y and, in space, z [m, world], and the track's name; what else there is does not count. A
-    ``.npy`` without names has them in this order, the last one the track's number. Rows of a CSV count from its header,
-    which is row 1, and others' from 0.
+    Columns are time [s], x, y and, in space, z [m, world], and the track's name; further columns are ignored. A
+    ``.npy`` without names has them in this order, with the track's number last. Rows of a CSV are counted from its
+    header, which is row 1; rows of other files from 0.
 
     Raises:
-        InputError: there is no such file, a column is missing, an entry is no number or too large, or a sample is not
-            later than the one before it of the same track; the message names the row and the column.
+        InputError: there is no such file, a column is missing, an entry is not a number or too large, or a sample is
+            not later than the previous one of its track; the message names the row and the column.
     """
     file = Path(file)
     if not is_file(file):
@@ -86,9 +86,9 @@ def read_tracks(file: Path) -> Tracks:
 
 
 def at_control_steps(tracks: Tracks, control_step: float) -> list[Tensor]:
-    """Places ``(T, 3)`` float32 of each track at every control step from its first sample on, linear between samples.
+    """Positions ``(T, 3)`` float32 of each track at every control step from its first sample, by linear interpolation.
 
-    A track is cut where it has a gap (`GAP`); pieces of fewer than two samples are left out.
+    A track is split at gaps (`GAP`); pieces of fewer than two samples are dropped.
     """
     spans = list(_pieces(tracks, control_step))
     total = sum(tracks.time[piece[-1]] - tracks.time[piece[0]] for piece in spans) / control_step
@@ -109,7 +109,7 @@ def at_control_steps(tracks: Tracks, control_step: float) -> list[Tensor]:
 
 
 def shard_of(paths: Sequence[Tensor], control_step: float) -> dict[str, Tensor]:
-    """``paths`` (T, 3) of any lengths as a shard of data, with the mean speed of each [m/s]."""
+    """``paths`` (T, 3) of any lengths as a data shard, with the mean speed of each [m/s]."""
     length = torch.tensor([len(path) for path in paths])
     ways = [path.diff(dim=0).norm(dim=-1).sum() / ((len(path) - 1) * control_step) for path in paths]
     return {
@@ -122,7 +122,7 @@ def shard_of(paths: Sequence[Tensor], control_step: float) -> dict[str, Tensor]:
 
 
 def _pieces(tracks: Tracks, control_step: float) -> Iterator[np.ndarray[Any, Any]]:
-    """Indices of the samples of each track without gaps, of two samples at least."""
+    """Indices of the samples of each piece without gaps, at least two samples long."""
     order = np.argsort(tracks.track, kind="stable")
     ends = np.flatnonzero(np.diff(tracks.track[order])) + 1
     for rows in np.split(order, ends):
@@ -148,7 +148,7 @@ def _check_order(tracks: Tracks) -> None:
 
 
 def _numbers(file: Path, name: str, values: Any, rows: np.ndarray[Any, Any]) -> np.ndarray[Any, Any]:
-    """``values`` of a column as float64; raises `InputError` for the first that is no number of some size."""
+    """``values`` of a column as float64; raises `InputError` for the first that is not a number or too large."""
     try:
         found = np.asarray(values, dtype=np.float64)
     except (TypeError, ValueError):
@@ -171,7 +171,7 @@ def _number(value: Any) -> float:
 
 
 def _chosen(file: Path, columns: Mapping[str, Any]) -> dict[str, Any]:
-    """The columns of a recording by their own names; raises `InputError` if one is missing, or is there twice."""
+    """The columns of a recording by their standard names; raises `InputError` if one is missing or duplicated."""
     lowered = {str(name).strip().lower(): values for name, values in columns.items()}
     found: dict[str, Any] = {}
     for name, calls in COLUMNS.items():
@@ -192,7 +192,7 @@ def _read_csv(file: Path) -> tuple[dict[str, Any], int]:
         try:
             header, *lines = list(csv.reader(opened)) or [[]]
         except (UnicodeDecodeError, csv.Error) as error:
-            raise InputError(f"{short_path(file)} is no CSV: {error}") from error
+            raise InputError(f"{short_path(file)} is not a CSV file: {error}") from error
     while lines and not lines[-1]:
         lines.pop()
     for number, line in enumerate(lines, start=2):
@@ -211,17 +211,17 @@ def _read_parquet(file: Path) -> tuple[dict[str, Any], int]:
     try:
         table = parquet.read_table(file)
     except (arrow.ArrowException, OSError) as error:
-        raise InputError(f"{short_path(file)} is no Parquet file: {error}") from error
+        raise InputError(f"{short_path(file)} is not a Parquet file: {error}") from error
     # Missing values become None.
     return _chosen(file, {name: table[name].to_pylist() for name in table.column_names}), 0
 
 
 def _read_numpy(file: Path) -> tuple[dict[str, Any], int]:
-    """Columns of an array with names, of one whose columns have their order, or of several arrays, as `_read_csv`."""
+    """Columns of a structured array, of a plain array in the standard order, or of several arrays; like `_read_csv`."""
     try:
         loaded = np.load(file, allow_pickle=False)
     except (ValueError, OSError, EOFError) as error:
-        raise InputError(f"{short_path(file)} is no NumPy file without pickles: {error}") from error
+        raise InputError(f"{short_path(file)} is not a NumPy file without pickles: {error}") from error
     if not isinstance(loaded, np.ndarray):
         columns = _chosen(file, {name: loaded[name] for name in loaded.files})
         shapes = {name: values.shape for name, values in columns.items()}

@@ -46,22 +46,22 @@ def train(
     Args:
         task: whose network, or its name.
         network: ``forecaster``, ``eta``, ``nearest_eta``, ``spread``, ``noisy_forecaster`` and ``noisy_spread`` for
-            targets that are measured with noise, or one of the task's policies. A spread is fitted to the errors of
-            the forecaster in ``out``, or of the shipped one if there is none.
+            noisy measurements, or one of the task's policies. A spread is fitted to the errors of the forecaster in
+            ``out``, or of the shipped one if there is none.
         data: folder of the collected shards; not used for a policy.
         out: gets a folder of the network's name with checkpoint, curve, weights and card.
-        steps: optimiser steps, of a policy rounds; the recipe's own for None, as are ``batch`` and ``lr``.
-        batch: samples a step.
-        lr: highest learning rate; of a policy the critic's, and the actor's in the proportion of its recipe.
-        seed: of initialisation, held-out data and draws.
+        steps: optimiser steps, or rounds for a policy; the recipe's value for None, as for ``batch`` and ``lr``.
+        batch: samples per step.
+        lr: highest learning rate; for a policy the critic's, with the actor's in the recipe's proportion.
+        seed: seed of initialisation, held-out data and draws.
         device: where to train.
         resume: whether to continue from the checkpoint in ``out``.
-        num_envs: of a policy: episodes simulated at once; the recipe's value for None.
-        num_threads: of a policy: threads of the simulation, 0 for all cores; does not change the result.
-        workers: of a policy: Ray workers that run the episodes, 0 for none.
-        static: of ``eta`` and ``nearest_eta``: the static planner whose arrivals the data must be; any for None.
-        options: of a policy: an instance of its `PolicyTraining.options`; the defaults for None.
-        algorithm: of a policy: ``ddpg``, ``averaged``; that of the task's recipe for None.
+        num_envs: for a policy: episodes simulated at once; the recipe's value for None.
+        num_threads: for a policy: threads of the simulation, 0 for all cores; does not change the result.
+        workers: for a policy: Ray workers that run the episodes, 0 for none.
+        static: for ``eta`` and ``nearest_eta``: static planner that the data must be of; any for None.
+        options: for a policy: an instance of its `PolicyTraining.options`; the defaults for None.
+        algorithm: for a policy: ``ddpg`` or ``averaged``; the one of the task's recipe for None.
 
     Returns:
         The weights' file.
@@ -91,7 +91,7 @@ def train(
     recipe = changed(own, steps=steps, lr=lr, device=device, **given)
     kind = network.removeprefix(NOISY)
     if kind != network and fitting.noisy_forecaster is None:
-        raise InputError(f"{task.name} has no forecaster for targets that are measured with noise")
+        raise InputError(f"{task.name} has no forecaster for noisy measurements")
     if kind == "forecaster":
         config = fitting.forecaster if kind == network else fitting.noisy_forecaster
         return fit.fit_forecaster(task, data, out, recipe, config=config, resume=resume, name=network)
@@ -108,7 +108,7 @@ def train(
 def _refuse_policy_arguments(network: str, **given: Any) -> None:
     for name, value in given.items():
         if value is not None:
-            raise InputError(f"{name} is of policies, which learn by trial: {network} has none, got {value!r}")
+            raise InputError(f"{name} is for policies only: {network} has none, got {value!r}")
 
 
 def changed(recipe: Any, **changes: Any) -> Any:

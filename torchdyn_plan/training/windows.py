@@ -1,4 +1,4 @@
-"""Windows of a target's recorded path: the history that a forecaster sees and the future that it should emit."""
+"""Windows of a target's recorded path: the history that a forecaster reads and the future that it should emit."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from torchdyn_plan.training.shards import read_shards
 
 
 class Paths(NamedTuple):
-    """Recorded paths of E episodes, end to end."""
+    """Recorded paths of E episodes, concatenated."""
 
     positions: Tensor
     """(T, 3) [m, world], one per control step."""
@@ -27,7 +27,7 @@ class Paths(NamedTuple):
     length: Tensor
     """(E,) int64 samples of each episode."""
     lost: Tensor
-    """(E,) bool: the last sample is a lost target, which stays there for ever; ``pocketed`` in the files."""
+    """(E,) bool: the target is lost at the last sample and stays there; ``pocketed`` in the files."""
 
 
 class Windows(NamedTuple):
@@ -36,9 +36,9 @@ class Windows(NamedTuple):
     history: Tensor
     """(*B, H, 3) [m, world], padded at the front with the first sample."""
     history_length: Tensor
-    """(*B,) int64 rows of the history that are no padding."""
+    """(*B,) int64 number of rows of the history that are not padding."""
     future: Tensor
-    """(*B, F, 3) [m, world], or on the unreflected line if that was asked for."""
+    """(*B, F, 3) [m, world], or on the unreflected line if requested."""
     recorded: Tensor
     """(*B, F) bool: false after the target was lost, where the future repeats its last position."""
     lost: Tensor
@@ -46,21 +46,21 @@ class Windows(NamedTuple):
     moving: Tensor
     """(*B,) bool: the target moves at the window's present."""
     covariance: Tensor | None = None
-    """(*B, 2, 2) of position and velocity at the present, where a track saw the target [m², m²/s; m²/s, m²/s²]."""
+    """(*B, 2, 2) present covariance of position and velocity, for targets seen by a track [m², m²/s; m²/s, m²/s²]."""
 
     @classmethod
     def joined(cls, parts: Sequence[Windows]) -> Windows:
-        """All of them, one after the other; either all or none were seen by a track."""
+        """Concatenate them; either all or none were seen by a track."""
         joined: list[Any] = [None if values[0] is None else torch.cat(values) for values in zip(*parts, strict=True)]
         return cls(*joined)
 
     @property
     def seen(self) -> tuple[Tensor, ...]:
-        """What a forecaster reads of them."""
+        """The forecaster's inputs."""
         return (self.history,) if self.covariance is None else (self.history, self.covariance)
 
     def doubt(self, control_step: float) -> Tensor:
-        """Standard deviation (*B, F) of the future along each axis by what the track knows of the present [m]."""
+        """Standard deviation (*B, F) of the future along each axis, from the track's present covariance [m]."""
         if self.covariance is None:
             return torch.zeros_like(self.future[..., 0])
         time = control_step * torch.arange(1.0, self.future.shape[-2] + 1.0)
@@ -73,17 +73,17 @@ class WindowConfig:
     """How windows are drawn from paths."""
 
     history: int = 24
-    """Positions H before and at the present."""
+    """Number H of positions up to the present."""
     horizon: int = 300
-    """Positions F after it."""
+    """Number F of positions after it."""
     first_step: int = 13
     """Earliest present: the step of the first plan."""
     early_share: float = 0.2
     """Share of windows whose present lies between ``first_step`` and H, so that their history is padded."""
     shortened_share: float = 0.2
-    """Share of windows anywhere whose history is padded as if the episode had just begun."""
+    """Share of all windows whose history is padded as if the episode had just started."""
     still_speed: float = 2e-4
-    """Motion below which a target counts as still [m a step]."""
+    """Speed below which a target counts as still [m a step]."""
 
     def __post_init__(self) -> None:
         for name in ("history", "horizon"):
@@ -95,7 +95,7 @@ class WindowConfig:
 
 
 def load_paths(folder: Path) -> Paths:
-    """Every ``paths-*.safetensors`` of ``folder`` as one; raises `InputError` if there is none or one is broken."""
+    """All ``paths-*.safetensors`` of ``folder`` as one; raises `InputError` if there is none or one is broken."""
     parts: list[Paths] = []
     offset = 0
     for shard in read_shards(folder, "paths", ("positions", "start", "length", "pocketed")):
@@ -106,7 +106,7 @@ def load_paths(folder: Path) -> Paths:
 
 
 def _check_paths(folder: Path, shard: dict[str, Tensor]) -> None:
-    """Raise `InputError` unless the paths of a shard lie end to end, and are numbers."""
+    """Raise `InputError` unless the paths of a shard are concatenated without gaps, and finite."""
     where = f"of the paths in {short_path(Path(folder))}"
     check_trailing_shape(f"positions {where}", shard["positions"], 3)
     check_finite(f"positions {where}", shard["positions"])
@@ -120,7 +120,7 @@ def _check_paths(folder: Path, shard: dict[str, Tensor]) -> None:
 
 
 def last_useful_step(paths: Paths, config: WindowConfig) -> Tensor:
-    """Latest present of a window, (E,) int64: its future is recorded, and the target has moved until shortly before."""
+    """Latest present of a window, (E,) int64: its future is recorded, and the target moved until shortly before."""
     step = torch.nn.functional.pad(paths.positions.diff(dim=0).norm(dim=-1), (1, 0))
     episode = torch.repeat_interleave(torch.arange(len(paths.length)), paths.length)
     index = torch.arange(len(paths.positions)) - paths.start[episode]
@@ -143,7 +143,7 @@ def draw_windows(
     shape = episodes.shape
     chance, place, kind, cut = torch.rand((4, *shape), generator=generator)
     last = last_step[episodes]
-    # Squared: presents lie denser where targets are still fast.
+    # Squared, so that presents are denser while targets are still fast.
     latest = torch.where(chance < config.early_share, last.clamp(max=config.history), last)
     present = config.first_step + (place.square() * (latest - config.first_step + 1)).long()
     shortest = min(config.first_step, config.history)
@@ -155,9 +155,9 @@ def draw_windows(
 def cut_windows(
     paths: Paths, episodes: Tensor, present: Tensor, seen: Tensor, config: WindowConfig, *, lines: Lines | None = None
 ) -> Windows:
-    """Windows at steps ``present`` (M,) of ``episodes`` (M,), of whose history ``seen`` (M,) rows are no padding.
+    """Windows at steps ``present`` (M,) of ``episodes`` (M,); ``seen`` (M,) rows of the history are not padding.
 
-    With ``lines`` the futures are the unreflected ones, as continued from the stretch of table that the target is on.
+    With ``lines`` the futures are unreflected, continued from the stretch of table that the target is on.
     """
     last = paths.length[episodes] - 1
     first, now = paths.start[episodes], paths.start[episodes] + present

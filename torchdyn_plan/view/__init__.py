@@ -38,15 +38,15 @@ __getattr__, __dir__ = lazy_names(
 
 
 def draw_without_screen() -> None:
-    """Let MuJoCo draw by EGL on a Linux machine without a screen, unless ``MUJOCO_GL`` says how it is to draw.
+    """Let MuJoCo render with EGL on a Linux machine without a screen, unless ``MUJOCO_GL`` is set.
 
-    MuJoCo decides when it is first imported: afterwards this changes nothing. Raises `InputError` if it cannot.
+    MuJoCo decides when it is first imported; afterwards this has no effect. Raises `InputError` if it cannot render.
     """
     if sys.platform.startswith("linux") and not os.environ.get("DISPLAY"):
         os.environ.setdefault("MUJOCO_GL", "egl")
     try:
         import_module("mujoco")
-    except Exception as error:  # What fails, and how, depends on the machine's graphics library.
+    except Exception as error:  # The exception depends on the machine's graphics library.
         backend = os.environ.get("MUJOCO_GL", "")
         raise InputError(
             f"MuJoCo cannot draw here with MUJOCO_GL={backend!r} ({error}): install EGL or OSMesa, and set MUJOCO_GL "

@@ -1,4 +1,4 @@
-"""What a person moves on the page, and what the page says: one method for each folder of it."""
+"""The page's control panel and its messages: one method for each folder of the panel."""
 
 from __future__ import annotations
 
@@ -20,20 +20,20 @@ if TYPE_CHECKING:
 
 NO_PLANNER = "none"
 SPEEDS = {"1": 1.0, "1/2": 0.5, "1/4": 0.25, "1/10": 0.1}
-"""How fast the page plays, by what is shown: 1 is as fast as the world."""
+"""Playback speeds by label: 1 is real time."""
 SENSOR_RANGES: Mapping[str, tuple[float, float, str]] = {
     "rate": (240.0, 10.0, "Measurements a second [Hz], 0 for one at each control step"),
     "noise": (0.03, 0.001, "Standard deviation along each axis [m]"),
-    "latency": (0.1, 0.004, "From when it is taken until it is seen [s]"),
-    "jitter": (0.02, 0.001, "Standard deviation of the moment [s]"),
-    "dropout": (0.9, 0.05, "Share that is lost"),
-    "quantisation": (0.03, 0.001, "Whole multiples of this [m], 0 for any number"),
+    "latency": (0.1, 0.004, "Time from a measurement to its arrival [s]"),
+    "jitter": (0.02, 0.001, "Standard deviation of the time of a measurement [s]"),
+    "dropout": (0.9, 0.05, "Share of lost measurements"),
+    "quantisation": (0.03, 0.001, "Measurements are rounded to multiples of this [m], 0 for no rounding"),
 }
-"""Greatest value, step and hint of each number of a `Sensor`; all begin at 0."""
+"""Largest value, step and hint of each number of a `Sensor`; all start at 0."""
 
 
 class Controls:
-    """The panel beside the world."""
+    """The page's control panel."""
 
     def __init__(self, server: Any, scenarios: Sequence[Scenario], page: Page) -> None:
         """Build the panel of the task of ``scenarios``, with their choices."""
@@ -118,12 +118,12 @@ class Controls:
         self.page.go_to(self.page.step)
 
     def _wanted(self, handle: Any) -> Any:
-        """``handle``, whose every change asks for another recording."""
+        """``handle``, with every change requesting a new recording."""
         handle.on_update(lambda _: self._ask())
         return handle
 
     def _ask(self) -> None:
-        """Ask for what the panel says; a combination that cannot be is said on the page."""
+        """Request a recording with the panel's settings; an invalid combination is reported on the page."""
         try:
             scenarios = self.scenarios()
         except TorchdynPlanError as error:
@@ -133,10 +133,10 @@ class Controls:
         self.page.want(scenarios)
 
     def scenarios(self) -> list[Scenario]:
-        """What the panel says; raises `InputError` for a combination that cannot be."""
+        """The panel's settings; raises `InputError` for an invalid combination."""
         first = self._first
         numbers: dict[str, Any] = {name: slider.value for name, slider in self._sensor.items()}
-        # No rate is one measurement at each control step.
+        # Rate 0 stands for one measurement at each control step.
         numbers["rate"] = numbers["rate"] or None
         sensor = Sensor(**numbers)
         settings = {name: handle.value for name, handle in self._settings.items()}
@@ -153,20 +153,20 @@ class Controls:
         return [dataclasses.replace(first, planner=name, **changes) for name in names]
 
     def _chosen_track(self, sensor: Sensor) -> Track | None:
-        """The track that was given if it is still chosen for the same sensor, another one by its name."""
+        """The given track if it is still selected for the same sensor, otherwise a new one by its name."""
         first, name = self._first, self._track.value
         if name != NO_TRACK and isinstance(first.track, TRACKS[name]) and sensor == (first.sensor or Sensor()):
             return first.track
         return track_named(name, sensor)
 
     def play(self) -> None:
-        """Go on, from the beginning if the end is shown."""
+        """Play, from the beginning if the end is shown."""
         if self.page.step >= self.page.length:
             self.page.go_to(0)
         self.page.playing, self._play.label = True, "Pause"
 
     def pause(self) -> None:
-        """Stop where it is."""
+        """Pause."""
         self.page.playing, self._play.label = False, "Play"
 
     def _jump(self, word: str) -> None:
@@ -175,41 +175,41 @@ class Controls:
         self.page.go_to({"|<": 0, "<": now - 1, ">": now + 1, ">|": self.page.length}[word])
 
     def _scrub(self, event: Any) -> None:
-        # The page moves the slider, too; only a person has a client.
+        # The page itself also moves the slider; only a user's event has a client.
         if event.client is not None:
             self.pause()
             self.page.go_to(self._scrubber.value)
 
     @property
     def says(self) -> str:
-        """What the page is doing, or what went wrong."""
+        """The page's state or error message."""
         return self._state.content
 
     def say_state(self, text: str) -> None:
-        """Say what the page is doing."""
+        """Show what the page is doing."""
         self._state.content = text
 
     def say_error(self, text: str) -> None:
-        """Say what went wrong, until something else is shown."""
+        """Show an error until something else is shown."""
         self.pause()
         self._state.content = f"**Error.** {text}"
 
     def show_recordings(self, recordings: Sequence[Recording]) -> None:
-        """New ``recordings`` are there, at their beginning."""
+        """Show new ``recordings`` from their beginning."""
         task, first = recordings[0].scenario.task, recordings[0].scenario
         self._scrubber.max = max(recording.length for recording in recordings)
         self.say_state(f"{task.name}, episode {first.episode}")
         self.play()
 
     def show_step(self, recordings: Sequence[Recording], step: int) -> None:
-        """Say how everything stands at ``step``."""
+        """Show the state at ``step``."""
         if int(self._scrubber.value) != step:
             self._scrubber.value = step
         self._said.content = "\n\n".join(describe(recording, step) for recording in recordings)
 
 
 def describe(recording: Recording, step: int) -> str:
-    """How a recording stands at ``step``, and how it ended once it has."""
+    """State of a recording at ``step``, and its outcome once it has ended."""
     now, name = min(step, recording.length), recording.scenario.planner.replace("_", " ")
     plan, plans = plan_line(recording, now), int(recording.replans[now])
     if now == recording.length:

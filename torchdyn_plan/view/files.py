@@ -1,4 +1,4 @@
-"""Moving pictures and strips of pictures, by the ending of the file's name."""
+"""Films and strips of pictures; the file extension decides the format."""
 
 from __future__ import annotations
 
@@ -17,9 +17,9 @@ from torchdyn_plan.view.pictures import GAP, Film
 MOVING = (".mp4", ".gif", ".webp")
 STILL = ".png"
 ENDINGS = (*MOVING, STILL)
-"""What a name may end in: films, and a strip of single pictures."""
+"""File extensions: films, and a strip of single pictures."""
 COLUMNS = 4
-"""Pictures in a row of a strip at most, of one recording."""
+"""Most pictures in a row of a strip, for one recording."""
 
 
 def write_film(
@@ -33,21 +33,21 @@ def write_film(
     quality: int = 60,
     progress: Callable[[Iterable[int]], Iterable[int]] = iter,
 ) -> None:
-    """Write ``film`` to ``out``, whole or not at all.
+    """Write ``film`` to ``out``, atomically.
 
     Args:
         film: what is drawn.
-        out: ends in ``.mp4``, ``.gif`` or ``.webp`` for a moving picture, in ``.png`` for a strip.
-        fps: pictures a second of a moving picture; of a GIF, which counts in hundredths of a second, about so many.
-        speed: seconds of the episode in a second of a moving picture.
-        hold: its last picture stays for so long [s].
-        strip: pictures of a strip, at equal distances in time.
+        out: ``.mp4``, ``.gif`` or ``.webp`` for a film, ``.png`` for a strip.
+        fps: frames a second of a film; approximate for a GIF, which counts in hundredths of a second.
+        speed: seconds of the episode per second of a film.
+        hold: time for which the last picture stays [s].
+        strip: number of pictures in a strip, equally spaced in time.
         quality: of a WebP, 0 to 100.
-        progress: goes over the control steps that are drawn, to show how far it is.
+        progress: wraps the iteration over the control steps drawn, to show progress.
 
     Raises:
-        InputError: the name ends in something else, a number is out of range, this machine cannot draw, or it has
-            nothing that writes MP4.
+        InputError: the extension is another one, a number is out of range, this machine cannot render, or
+            imageio-ffmpeg, which writes MP4, is missing.
         OutputError: the file cannot be written.
     """
     check_film(out, strip=strip, quality=quality)
@@ -70,7 +70,7 @@ def write_film(
 
 
 def check_film(out: Path, *, strip: int = 8, quality: int = 60) -> None:
-    """Raise `InputError` for a file or a number that `write_film` would refuse, before anything is played."""
+    """Raise `InputError` for a file or a number that `write_film` would refuse, before an episode is played."""
     if out.suffix.lower() not in ENDINGS:
         raise InputError(f"out must end in one of {', '.join(ENDINGS)}, got {out.name!r}")
     check_number("strip", strip, minimum=1, maximum=100, integer=True)
@@ -80,7 +80,7 @@ def check_film(out: Path, *, strip: int = 8, quality: int = 60) -> None:
 
 
 def tiled(pictures: list[np.ndarray[Any, Any]]) -> np.ndarray[Any, Any]:
-    """``pictures`` of one size in rows, from left to right and top to bottom, on white."""
+    """``pictures`` of one size in a grid, from left to right and top to bottom, on white."""
     height, width, _ = pictures[0].shape
     columns = min(len(pictures), COLUMNS)
     rows = -(-len(pictures) // columns)
@@ -92,24 +92,24 @@ def tiled(pictures: list[np.ndarray[Any, Any]]) -> np.ndarray[Any, Any]:
 
 
 def with_one_palette(images: list[Image.Image]) -> list[Image.Image]:
-    """``images`` in the colours of the middle one: a GIF whose colours change from picture to picture flickers."""
+    """``images`` with the palette of the middle one: a GIF with changing palettes flickers."""
     palette = images[len(images) // 2].quantize(256)
     return [image.quantize(palette=palette, dither=Image.Dither.NONE) for image in images]
 
 
 def mp4_writer() -> Any:
-    """The module that writes MP4; raises `InputError` where there is none."""
+    """The module that writes MP4; raises `InputError` if it is not installed."""
     try:
         import imageio_ffmpeg  # pyright: ignore[reportMissingImports]
     except ImportError as error:
         raise InputError(
-            "an MP4 needs imageio-ffmpeg, of the extra view: pip install imageio-ffmpeg, or choose .webp or .gif"
+            "an MP4 needs imageio-ffmpeg (extra view): pip install imageio-ffmpeg, or choose .webp or .gif"
         ) from error
     return imageio_ffmpeg
 
 
 def write_mp4(writer: Any, out: Path, pictures: Iterable[np.ndarray[Any, Any]], fps: float) -> None:
-    """Write ``pictures`` to ``out`` as H.264, whose sides are even."""
+    """Write ``pictures`` to ``out`` as H.264, cropped to even sizes."""
     sink = None
     for picture in pictures:
         even = np.ascontiguousarray(picture[: picture.shape[0] // 2 * 2, : picture.shape[1] // 2 * 2])

@@ -1,6 +1,6 @@
-"""What a plan was made from: the forecast and how sure it is, every meeting that could be, and where the robot can go.
+"""What a plan was based on: the forecast and its uncertainty, all candidate meetings, and the reachable region.
 
-Nothing is computed twice: the planner's own search is given a companion that keeps what it is shown.
+Nothing is computed twice: the planner's own search is wrapped, and its inputs are kept.
 """
 
 from __future__ import annotations
@@ -21,35 +21,35 @@ if TYPE_CHECKING:
 SHARE = 0.8
 """The target is within the forecast's half-widths with this probability, along each axis."""
 CANDIDATES = 60
-"""Meetings that are shown, at most; of a search that looks at more every so many of them."""
+"""Most meetings shown; a search with more candidates is subsampled."""
 GRID = 17
-"""Places along a side of the square in which the reachable region is shown."""
+"""Points along a side of the square in which the reachable region is shown."""
 
 
 class Insight(NamedTuple):
-    """What a plan was made from, of one robot. All that is unknown is NaN."""
+    """What a plan of one robot was based on. Unknown values are NaN."""
 
     begin: int
-    """Control step since the reset from which on it counts: that in which the plan was to come into use."""
+    """Control step since the reset from which its times count: the step at which the plan was to be used."""
     path: Tensor
-    """``(F, D)`` where the target was expected 1 … F control steps later [m, world]."""
+    """``(F, D)`` forecast of the target 1 … F control steps later [m, world]."""
     half_width: Tensor
     """``(F, 2)`` half-widths along x and y of the interval that holds the target with P = `SHARE` [m]."""
     goals: Tensor
-    """``(K, D)`` where the tool could have been sent to meet the target [m, world]."""
+    """``(K, D)`` candidate goals of the tool [m, world]."""
     target_steps: Tensor
     """``(K,)`` control steps until the target is there."""
     slack: Tensor
     """``(K,)`` control steps that the robot would wait there for the target; negative if it would be late, -inf if it
-    never comes there, or if the target is lost by then."""
+    never arrives or the target is lost by then."""
     region: Tensor
-    """``(G, D)`` places on a grid to which the robot can go [m, world]."""
+    """``(G, D)`` grid points that the robot could go to [m, world]."""
     region_steps: Tensor
-    """``(G,)`` control steps that it needs there; infinite for never."""
+    """``(G,)`` control steps to reach them; infinite for never."""
 
 
 class Shown(NamedTuple):
-    """What a goal search is shown of B robots, but for the arrival model."""
+    """Inputs of a goal search for B robots, without the arrival model."""
 
     forecast: Forecast
     target_pos: Tensor
@@ -59,25 +59,25 @@ class Shown(NamedTuple):
 
 @dataclass(kw_only=True, eq=False)
 class WatchedSearch:
-    """A goal search that keeps what it is shown; it finds what the search inside finds."""
+    """Wraps a goal search and keeps its inputs; the result is unchanged."""
 
     search: GoalSearch
     shown: list[Shown] = field(default_factory=list)
-    """What it was shown since this was last asked for."""
+    """Inputs since the list was last read."""
 
     def __call__(
         self, forecast: Forecast, target_pos: Tensor, eta: ArrivalQuery, context: SearchContext = NO_CONTEXT
     ) -> Meeting:
-        """As of `GoalSearch`."""
+        """See `GoalSearch`."""
         self.shown.append(Shown(forecast, target_pos, context))
         return self.search(forecast, target_pos, eta, context)
 
 
 class Watch:
-    """Plays for a planner, and tells what each of its plans was made from."""
+    """Runs a planner, and reports what each of its plans was based on."""
 
     def __init__(self, planner: Any) -> None:
-        """Watch ``planner``; of one that makes no plans there is nothing to tell."""
+        """Watch ``planner``; a planner without plans has nothing to report."""
         inner = planner.planner if isinstance(planner, TrackedPlanner) else planner
         self.planner, self._inner, self._search = planner, None, None
         if isinstance(inner, DynamicPlanner):
@@ -86,11 +86,11 @@ class Watch:
             self.planner = self._inner if inner is planner else planner.with_planner(self._inner)
 
     def insight(self, robot_state: Tensor, grid: Tensor, step: int) -> Insight | None:
-        """What the plan was made from that has just been made, None if there was none.
+        """What the plan just made was based on; None if no plan was made.
 
         Args:
             robot_state: ``(1, S)`` when it was made.
-            grid: ``(G, D)`` places at which to ask where the robot can go [m, world].
+            grid: ``(G, D)`` points for which arrival times are queried [m, world].
             step: control step since the reset.
         """
         if self._search is None or self._inner is None or not self._search.shown:
@@ -103,7 +103,7 @@ class Watch:
 
 
 def look_into(search: Any, shown: Shown, eta: ArrivalQuery, grid: Tensor, *, step: int, delay: int) -> Insight:
-    """The first row of what ``search`` was ``shown`` at control step ``step``, of the time from ``delay`` later on."""
+    """Insight of the first row, from the inputs ``shown`` to ``search`` at ``step``; times start ``delay`` later."""
     path, now, descent = shown.forecast.path[:1], shown.target_pos[:1], getattr(search, "descent_steps", 0.0)
     lost_at = shown.context.lost
     if hasattr(search, "candidates"):
@@ -120,7 +120,7 @@ def look_into(search: Any, shown: Shown, eta: ArrivalQuery, grid: Tensor, *, ste
     if shown.forecast.spread is not None:
         half_width = shown.forecast.spread.interval(SHARE)[0]
     places = search.goals(grid) if hasattr(search, "goals") else grid
-    # A goal that is moved to where the tool can be says nothing of the place itself.
+    # A goal that is moved into reach says nothing about the original position.
     moved = (places - grid)[:, :2].norm(dim=-1) > 1e-6
     return Insight(
         begin=step + delay,
@@ -135,6 +135,6 @@ def look_into(search: Any, shown: Shown, eta: ArrivalQuery, grid: Tensor, *, ste
 
 
 def _steps_to(eta: ArrivalQuery, goals: Tensor) -> Tensor:
-    """Control steps (1, K) to goals (1, K, D), infinitely many where the robot never arrives."""
+    """Control steps (1, K) to goals (1, K, D), infinite if the robot never arrives."""
     arrival = eta(goals, estimator="expectation")
     return arrival.steps.masked_fill(arrival.never.bool(), torch.inf)

@@ -1,7 +1,7 @@
-"""What is drawn beside a world at a control step, as ellipsoids: one picture of a plan, for page and files alike.
+"""The plan's layers at a control step, drawn as ellipsoids over the world, for the page and for files.
 
-Each layer has as many marks at every step of a recording; those that are not needed are invisible. Colours are those of
-Okabe and Ito, which the colour-blind tell apart.
+Each layer has the same number of marks at every step of a recording; unused marks are invisible. Colours are those of
+Okabe and Ito, which are safe for colour-blind readers.
 """
 
 from __future__ import annotations
@@ -17,11 +17,11 @@ from torchdyn_plan.view.recording import Recording
 YELLOW, BLUE, ORANGE, GREY = (0.94, 0.89, 0.26), (0.0, 0.45, 0.70), (0.84, 0.37, 0.0), (0.85, 0.85, 0.85)
 RED, WHITE, PURPLE, SKY = (0.80, 0.05, 0.10), (1.0, 1.0, 1.0), (0.80, 0.47, 0.65), (0.34, 0.71, 0.91)
 TRAIL, RIBBON, LATEST = 80, 75, 40
-"""Marks of the target's way so far and of its forecast, and measurements that are shown, at most."""
+"""Most marks for the target's path so far, for its forecast, and for measurements."""
 SLACK = 0.4
-"""A candidate is drawn in full colour when the robot is early or late by so much [s]."""
+"""Slack at which a candidate's colour saturates [s]."""
 FARTHEST = 2.0
-"""A place of the reachable region is drawn in full when the robot is there at once, and faintly after so long [s]."""
+"""Arrival time at which a point of the reachable region has faded [s]; points reached at once are opaque."""
 
 LAYERS = ("region", "trail", "forecast", "candidates", "goal", "measurements", "track", "tool", "target")
 """Names of all layers; those for which a recording has nothing are left out of `marks_at`."""
@@ -32,7 +32,7 @@ def marks_at(recording: Recording, step: int) -> dict[str, Marks]:
     unit, insight, look = recording.look.half_side / 100.0, recording.insight(step), recording.look
     found = {"trail": trail(recording, step, unit)}
     if recording.insights:
-        # Before the first plan there is nothing to see, but the same number of marks.
+        # Before the first plan nothing is visible, with the same number of marks.
         shown = recording.insights[0] if insight is None else insight
         found["region"] = region(shown, recording.scenario.task.control_step, unit)
         found["forecast"] = ribbon(shown, step, unit)
@@ -52,7 +52,7 @@ def marks_at(recording: Recording, step: int) -> dict[str, Marks]:
 
 
 def trail(recording: Recording, step: int, unit: float) -> Marks:
-    """The target's way until ``step``, fainter the longer ago."""
+    """The target's path until ``step``, fading with age."""
     stride = max(1, recording.length // TRAIL)
     number = np.arange(0, recording.length + 1, stride)
     past = number < step
@@ -61,12 +61,12 @@ def trail(recording: Recording, step: int, unit: float) -> Marks:
 
 
 def ribbon(insight: Insight, step: int, unit: float) -> Marks:
-    """The forecast from ``step`` on, as wide as the interval about it, and fainter the wider that is."""
+    """The forecast from ``step`` on, as wide as its interval, and fainter the wider it is."""
     path, width = np_of(insight.path), np_of(insight.half_width)
     number = np.arange(0, len(path), max(1, len(path) // RIBBON))
     to_come, path = insight.begin + number + 1 > step, path[number]
     width = np.clip(np.nan_to_num(width[number], nan=0.0), 0.0, 30.0 * unit) + 0.8 * unit
-    # So many marks lie on top of each other, which together are to be as faint as one.
+    # This many marks overlap, and together they should be as faint as one.
     apart = np.linalg.norm(np.diff(path, axis=0), axis=1)
     apart = np.append(apart, apart[-1:] if len(apart) else 0.0)
     overlap = np.clip(2.0 * width.mean(axis=1) / np.maximum(apart, 1e-9), 1.0, len(path))
@@ -76,7 +76,7 @@ def ribbon(insight: Insight, step: int, unit: float) -> Marks:
 
 
 def candidates(recording: Recording, insight: Insight, step: int, unit: float) -> Marks:
-    """Meetings that could be, blue where the robot would wait for the target and orange where it would be late."""
+    """Candidate meetings, blue if the robot would wait for the target and orange if it would be late."""
     most = max(len(one.goals) for one in recording.insights)
     slack = np_of(insight.slack) * recording.scenario.task.control_step
     opacity = np.where(insight.begin + np_of(insight.target_steps) < step, 0.0, 0.85)
@@ -93,7 +93,7 @@ def slack_colours(slack: np.ndarray[Any, Any]) -> np.ndarray[Any, Any]:
 
 
 def region(insight: Insight, control_step: float, unit: float) -> Marks:
-    """Where the robot can go, fainter the longer that takes."""
+    """The reachable region, fainter the longer it takes to get there."""
     seconds = np_of(insight.region_steps) * control_step
     opacity = np.where(np.isfinite(seconds), 0.6 - 0.5 * np.clip(seconds / FARTHEST, 0.0, 1.0), 0.0)
     sizes = np.array([[1.0, 1.0, 0.15]]) * unit
@@ -109,12 +109,12 @@ def measurements(recording: Recording, step: int, unit: float) -> Marks:
 
 
 def body(place: np.ndarray[Any, Any], ball: Ball) -> Marks:
-    """A tool or target that the model does not have."""
+    """A ball for a tool or target that the model does not contain."""
     return Marks.ball(tuple(place), *ball)
 
 
 def dots(places: Any, sizes: Any, colour: Any, opacity: Any) -> Marks:
-    """K marks at ``places`` (K, 2 or 3); sizes, colours and opacities are of each or of all. NaN is invisible."""
+    """K marks at ``places`` (K, 2 or 3); sizes, colours and opacities for each or for all. NaN is invisible."""
     places = np.asarray(places, dtype=float)
     places = np.pad(places, ((0, 0), (0, 3 - places.shape[1])))
     known, count = np.isfinite(places).all(axis=1), len(places)

@@ -1,4 +1,4 @@
-"""The page in the browser: an episode step by step, up to two planners side by side, on this machine alone."""
+"""The page in the browser: an episode step by step, up to two planners side by side, served to this machine only."""
 
 from __future__ import annotations
 
@@ -20,29 +20,29 @@ from torchdyn_plan.view.recording import Recording, Scenario, record_episode
 from torchdyn_plan.view.stage import Stage, camera_of, places_of
 
 HOST = "127.0.0.1"
-"""The page is served to this machine alone; there is no option for another."""
+"""The page is served to this machine only; there is no option for another address."""
 RATE = 40.0
-"""Steps of the page that are sent a second while it plays, at most [Hz]."""
+"""Most updates of the page per second while it plays [Hz]."""
 TOLD_EVERY = 25
-"""The page says how far a recording is every so many control steps."""
+"""Control steps between progress messages of a recording."""
 FIELD_OF_VIEW = math.radians(45.0)
-"""From top to bottom, as MuJoCo's [rad]."""
+"""Vertical field of view, as in MuJoCo [rad]."""
 WIDER = 2.3
-"""The camera stands so much farther away from two worlds than from one."""
+"""Factor on the camera's distance for two worlds."""
 
 
 class Superseded(Exception):  # noqa: N818
-    """What is being recorded is not wanted any more."""
+    """The recording in progress has been replaced by another request."""
 
 
 class Page:
-    """Serves the page, records what is asked for in a thread of its own, and plays it in another."""
+    """Serves the page, records episodes in one thread, and plays them in another."""
 
     def __init__(self, scenarios: Sequence[Scenario], *, port: int = 8080) -> None:
-        """Serve the page, which shows ``scenarios`` at first, one or two of one episode.
+        """Serve the page, initially with ``scenarios``: one or two, of the same episode.
 
         Raises:
-            InputError: there are none, or more than two, the port is none, or the libraries of the page are missing.
+            InputError: there are none or more than two, the port is invalid, or the page's libraries are missing.
         """
         if not 1 <= len(scenarios) <= 2:
             raise InputError(f"the page shows one planner or two, got {len(scenarios)}")
@@ -50,7 +50,7 @@ class Page:
         self.server = local_server(port)
         self.recordings: list[Recording] = []
         self.pushed = 0
-        """Steps of the page that have been sent."""
+        """Number of updates sent."""
         self._stages: list[Stage] = []
         self._scene = threading.RLock()
         self._wanted = threading.Condition()
@@ -66,16 +66,16 @@ class Page:
 
     @property
     def address(self) -> str:
-        """Where the page is."""
+        """URL of the page."""
         return f"http://{HOST}:{self.server.get_port()}"
 
     @property
     def length(self) -> int:
-        """Control steps until the last recording has ended; 0 before there is one."""
+        """Control steps of the longest recording; 0 before the first one."""
         return max((recording.length for recording in self.recordings), default=0)
 
     def want(self, scenarios: Sequence[Scenario]) -> None:
-        """Show ``scenarios`` as soon as they are recorded; what is being recorded is given up."""
+        """Show ``scenarios`` as soon as they are recorded; a recording in progress is abandoned."""
         with self._wanted:
             self._request = tuple(scenarios)
             self._wanted.notify_all()
@@ -96,7 +96,7 @@ class Page:
         self.server.stop()
 
     def _record_all(self) -> None:
-        """Record whatever is wanted, for as long as the page is served."""
+        """Record requested scenarios as long as the page is served."""
         while not self._closed:
             with self._wanted:
                 self._wanted.wait_for(lambda: self._closed or self._request is not None)
@@ -105,12 +105,12 @@ class Page:
                 self._record(wanted)
 
     def _record(self, wanted: Sequence[Scenario]) -> None:
-        """Record and show what is ``wanted``; what goes wrong is said on the page."""
+        """Record and show the ``wanted`` scenarios; errors are shown on the page."""
         try:
             self._show([record_episode(one, lambda step, one=one: self._report(one, step)) for one in wanted])
         except Superseded:
             return
-        except Exception as error:  # Whatever a planner raises: the page goes on, and says it.
+        except Exception as error:  # A planner may raise anything; the page reports it and continues.
             if not isinstance(error, TorchdynPlanError):
                 traceback.print_exception(error, file=sys.stderr)
             self.playing = False
@@ -123,7 +123,7 @@ class Page:
             self.controls.say_state(f"Playing {scenario.planner}: step {step} of at most {scenario.task.max_steps}")
 
     def _show(self, recordings: list[Recording]) -> None:
-        """Put ``recordings`` on the page in place of those that are there."""
+        """Replace the recordings on the page."""
         look, count = recordings[0].look, len(recordings)
         with self._scene, self.server.atomic():
             for stage in self._stages:
@@ -141,16 +141,16 @@ class Page:
             self._place_cameras(count)
 
     def _place_cameras(self, count: int) -> None:
-        """Let everybody who watches see ``count`` worlds."""
+        """Place every client's camera so that ``count`` worlds are visible."""
         place, lookat, _ = camera_of(self.recordings[0].look)
         place = lookat + (1.0 if count == 1 else WIDER) * (place - lookat)
         for camera in (self.server.initial_camera, *(client.camera for client in self.server.get_clients().values())):
-            # One who has just come has no camera yet, and begins with the initial one.
+            # A client that has just connected has no camera yet, and starts with the initial one.
             with contextlib.suppress(AssertionError):
                 camera.position, camera.look_at, camera.fov = place, lookat, FIELD_OF_VIEW
 
     def _play(self) -> None:
-        """Go on in time with the clock while the page plays."""
+        """Advance with the clock while the page plays."""
         before = time.monotonic()
         while not self._closed:
             time.sleep(max(0.0, before + 1.0 / RATE - time.monotonic()))
@@ -161,7 +161,7 @@ class Page:
                     self._advance(passed)
 
     def _advance(self, seconds: float) -> None:
-        """Go on by ``seconds`` of the clock, and stop at the end."""
+        """Advance by ``seconds`` of the clock, and stop at the end."""
         if self.step >= self.length:
             self.controls.pause()
             return
@@ -170,7 +170,7 @@ class Page:
         self._push()
 
     def _push(self) -> None:
-        """Send the present step to everybody who watches."""
+        """Send the present step to all clients."""
         step = int(self.step)
         with self.server.atomic():
             for stage in self._stages:
@@ -180,7 +180,7 @@ class Page:
 
 
 def local_server(port: int) -> Any:
-    """A viser server that listens on `HOST` alone and opens no tunnel to the outside; raises `InputError`."""
+    """A viser server that listens on `HOST` only, without a tunnel to the outside; raises `InputError`."""
     try:
         import mjviser  # noqa: F401
         import viser

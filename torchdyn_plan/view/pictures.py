@@ -1,4 +1,4 @@
-"""Pictures of recordings, side by side, with a line of text about each."""
+"""Pictures of recordings side by side, each with a line of text."""
 
 from __future__ import annotations
 
@@ -20,11 +20,11 @@ PAPER, INK, FAINT, GOOD, BAD = (250, 250, 248), (25, 25, 25), (95, 95, 95), (0, 
 GAP = 4
 """Between two pictures [pixels]."""
 LARGEST_FPS = 60
-"""Pictures a second of a film at most."""
+"""Highest frame rate of a film [Hz]."""
 
 
 class Film:
-    """Draws recordings of one episode side by side; a recording that has ended stays as it was at its end."""
+    """Draws recordings of one episode side by side; a recording that has ended shows its last step."""
 
     def __init__(
         self,
@@ -37,7 +37,7 @@ class Film:
         """Draw ``recordings``, each ``width`` by ``height`` pixels and its text; of the marks only ``layers``.
 
         Raises:
-            InputError: there is no recording, a size is no whole number of pixels, or they do not fit side by side.
+            InputError: there is no recording, a size is not a whole number of pixels, or the recordings do not match.
         """
         if not recordings:
             raise InputError("a film needs at least one recording, got none")
@@ -50,11 +50,11 @@ class Film:
 
     @property
     def length(self) -> int:
-        """Control steps until the last recording has ended."""
+        """Control steps of the longest recording."""
         return max(recording.length for recording in self.recordings)
 
     def picture(self, step: int) -> np.ndarray[Any, Any]:
-        """Control step ``step`` of all, ``(height + text, width of all, 3)`` uint8; raises as `Painter.picture`."""
+        """All recordings at ``step``, ``(height + text, total width, 3)`` uint8; raises like `Painter.picture`."""
         count = len(self.recordings)
         image = Image.new("RGB", (count * self.width + (count - 1) * GAP, self.height + 2 * self.bar), PAPER)
         for number, recording in enumerate(self.recordings):
@@ -64,7 +64,7 @@ class Film:
         return np.asarray(image)
 
     def _draw(self, number: int, step: int) -> Image.Image:
-        """The world of recording ``number``, which is not drawn again while it does not move."""
+        """The world of recording ``number``; drawn again only if it has moved."""
         before, drawn = self._drawn.get(number, (None, None))
         if drawn is None or before != step:
             recording, painter = self.recordings[number], self._painters[number]
@@ -83,12 +83,12 @@ class Film:
         draw.text((middle, below), caption(recording, step), colour, font(round(0.9 * size)), anchor="mm")
 
     def steps(self, *, fps: float, speed: float, hold: float = 0.0) -> list[int]:
-        """Control steps of the pictures of a moving film.
+        """Control steps of a film's frames.
 
         Args:
-            fps: pictures a second.
-            speed: seconds of the episode that pass in a second of the film.
-            hold: the last picture stays for so long [s].
+            fps: frames a second.
+            speed: seconds of the episode per second of the film.
+            hold: time for which the last picture stays [s].
 
         Raises:
             InputError: a number is out of range.
@@ -101,7 +101,7 @@ class Film:
         return [*moving.tolist(), *[self.length] * round(hold * fps)]
 
     def pictures(self, steps: Iterable[int]) -> Iterator[np.ndarray[Any, Any]]:
-        """The pictures of ``steps`` in their order; one that is asked for again is not drawn again."""
+        """The pictures of ``steps`` in order; repeated steps are drawn once."""
         before, drawn = None, np.zeros(0)
         for step in steps:
             if step != before:
@@ -111,5 +111,5 @@ class Film:
 
 @cache
 def font(size: int) -> Any:
-    """Letters of ``size`` pixels."""
+    """A font of ``size`` pixels."""
     return ImageFont.load_default(size)

@@ -1,4 +1,4 @@
-"""One episode, played by one planner and kept step by step: what page and pictures show."""
+"""One episode played by one planner, recorded step by step, for the page and for pictures."""
 
 from __future__ import annotations
 
@@ -28,14 +28,14 @@ from torchdyn_plan.threads import one_thread
 from torchdyn_plan.view.insight import GRID, Insight, Watch
 
 NOTHING = -1
-"""Stands for what is not there: no plan, no status."""
+"""Code for a missing value: no plan, no status."""
 LAST_EPISODE = 9999
-"""Highest number of an episode: what is known of an episode beforehand takes those before it, too."""
+"""Highest episode number, because the truth about an episode is computed together with all earlier ones."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class Scenario:
-    """Which episode of a task, and who plays it; what an evaluation of the same name plays as its episode number N."""
+    """An episode of a task and its planner; the same as episode N of an evaluation with these settings."""
 
     task: Task
     planner: str
@@ -43,18 +43,18 @@ class Scenario:
     static: str = ""
     """One of its static planners; the default one for an empty name."""
     settings: Settings | None = None
-    """Of the task; its defaults for None."""
+    """The task's settings; its defaults for None."""
     episode: int = 0
     seed: int = 0
     split: str = "test"
     weights: Path | None = None
-    """Folder of the planner's networks, as ``train`` leaves it; those that ship for None."""
+    """Folder of the planner's networks, as written by ``train``; the shipped ones for None."""
     delivery: Delivery | None = None
-    """How plans come late; at once for None."""
+    """When plans become available; at once for None."""
     sensor: Sensor | None = None
     """How the target is measured; exactly for None."""
     track: Track | None = None
-    """What becomes of the measurements; None for nothing."""
+    """Filter of the measurements; None for none."""
 
     def __post_init__(self) -> None:
         check_number("episode", self.episode, minimum=0, maximum=LAST_EPISODE, integer=True)
@@ -62,11 +62,11 @@ class Scenario:
 
     @property
     def chosen(self) -> Settings:
-        """The settings that are played."""
+        """The settings in use."""
         return self.task.default_settings() if self.settings is None else self.settings
 
     def make_planner(self) -> Any:
-        """The planner, as an evaluation makes it."""
+        """The planner, made as in an evaluation."""
         study = Study.of(
             self.task,
             (self.planner,),
@@ -81,7 +81,7 @@ class Scenario:
         return study.planners[self.planner]
 
     def make_env(self) -> MovingTargetEnv:
-        """The world, which the next reset brings to the beginning of the episode."""
+        """The environment; the next reset starts the episode."""
         batch: dict[str, Any] = {"num_envs": 1, "seed": self.seed, "split": self.split, "num_threads": 1}
         if self.sensor is not None and not self.sensor.is_exact:
             batch["sensor"] = self.sensor
@@ -90,16 +90,16 @@ class Scenario:
         return env
 
     def find_truth(self) -> Truth:
-        """What is known beforehand of this episode and those before it."""
+        """The truth about this episode and all earlier ones."""
         series: dict[str, Any] = {"episodes": self.episode + 1, "seed": self.seed, "split": self.split}
         return find_truth(self.task, self.chosen, static=self.static or None, num_threads=1, **series)
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Recording:
-    """An episode of T control steps; entries 0 … T are what was seen and planned at each of them, T its end.
+    """An episode of T control steps; entries 0 … T hold the observations and plans of each step, T being its end.
 
-    Places have 3 coordinates, of tasks in a plane the last one is 0 [m, world]. What is not there is NaN or `NOTHING`.
+    Positions have 3 coordinates; for tasks in a plane the last is 0 [m, world]. Missing values are NaN or `NOTHING`.
     """
 
     scenario: Scenario
@@ -109,34 +109,34 @@ class Recording:
     tool_pos: np.ndarray[Any, Any]
     """``(T + 1, 3)``"""
     target_pos: np.ndarray[Any, Any]
-    """``(T + 1, 3)``: the truth, whatever a sensor makes of it."""
+    """``(T + 1, 3)``: the true position, also with a sensor."""
     believed_pos: np.ndarray[Any, Any]
-    """``(T + 1, 3)``: where the planner takes the target to be; NaN where it sees the truth."""
+    """``(T + 1, 3)``: the planner's estimate of the target's position; NaN if it sees the true one."""
     measured_pos: np.ndarray[Any, Any]
-    """``(T + 1, M, 3)``: measurements that came at the step."""
+    """``(T + 1, M, 3)``: measurements that arrived at the step."""
     goal: np.ndarray[Any, Any]
-    """``(T + 1, 3)`` of the plan in force."""
+    """``(T + 1, 3)`` goal of the plan in use."""
     countdown: np.ndarray[Any, Any]
-    """``(T + 1,)`` control steps until the planned meeting; `NOTHING` of a planner that makes no plans."""
+    """``(T + 1,)`` control steps until the planned meeting; `NOTHING` for a planner without plans."""
     status: np.ndarray[Any, Any]
-    """``(T + 1,)`` `torchdyn_plan.planners.PlanStatus`; `NOTHING` of a planner that makes no plans."""
+    """``(T + 1,)`` `torchdyn_plan.planners.PlanStatus`; `NOTHING` for a planner without plans."""
     replans: np.ndarray[Any, Any]
-    """``(T + 1,)`` plans made until then."""
+    """``(T + 1,)`` plans made so far."""
     insights: Sequence[Insight]
-    """What each plan was made from, in order."""
+    """What each plan was based on, in order."""
     insight_at: np.ndarray[Any, Any]
-    """``(T + 1,)`` number of the latest of `insights`; `NOTHING` for none."""
+    """``(T + 1,)`` index of the latest of ``insights``; `NOTHING` for none."""
     success: bool
     cause: str
-    """Why the episode failed, one of the task's causes; empty for a success, or where the task names none."""
+    """Why the episode failed, one of the task's causes; empty for a success, or if the task defines no causes."""
 
     @property
     def length(self) -> int:
-        """Control steps T until the end."""
+        """Control steps T of the episode."""
         return len(self.tool_pos) - 1
 
     def insight(self, step: int) -> Insight | None:
-        """What the latest plan at control step ``step`` was made from."""
+        """What the latest plan at control step ``step`` was based on."""
         number = int(self.insight_at[step])
         return None if number == NOTHING else self.insights[number]
 
@@ -146,8 +146,8 @@ def record_episode(scenario: Scenario, progress: Callable[[int], object] | None 
     """Play the episode to its end.
 
     Args:
-        scenario: which episode, and who plays it.
-        progress: called with each control step; an exception that it raises ends the recording.
+        scenario: the episode and its planner.
+        progress: called at each control step; an exception from it ends the recording.
 
     Raises:
         InputError: an unknown name, a number out of range, or a planner that belongs to another scene.
@@ -179,12 +179,12 @@ def record_episode(scenario: Scenario, progress: Callable[[int], object] | None 
 
 
 def read_by(planner: Any) -> Sequence[Any]:
-    """Keys that ``planner`` reads; none of a plain function."""
+    """Keys that ``planner`` reads; none for a plain function."""
     return getattr(planner, "in_keys", ())
 
 
 def find_cause(scenario: Scenario, log: EpisodeLog, truth: Truth | None) -> str:
-    """Why the episode failed, by the task's own judgement; empty if the task judges nothing."""
+    """Why the episode failed, by the task's verdict; empty if the task gives none."""
     task = scenario.task
     if task.judge is None:
         return ""
@@ -194,17 +194,17 @@ def find_cause(scenario: Scenario, log: EpisodeLog, truth: Truth | None) -> str:
 
 
 class Roll:
-    """What is kept while an episode is played, a row for each control step."""
+    """Collects the recording while an episode is played, one row for each control step."""
 
     def __init__(self, env: MovingTargetEnv, watch: Watch) -> None:
-        """Nothing yet."""
+        """Start empty."""
         self.env, self.watch, self.look = env, watch, env.look()
         self.steps: list[dict[str, Any]] = []
         self.insights: list[Insight] = []
         self.grid = grid_about(self.look, env.coordinates)
 
     def add(self, planned: TensorDictBase, posture: np.ndarray[Any, Any]) -> None:
-        """Take in a step that was ``planned``, but not acted yet, of a world in that ``posture``."""
+        """Add a step that is ``planned`` but not executed yet, with the world in that ``posture``."""
         plan, step = planned.get(keys.PLAN, None), int(planned[keys.STEP_COUNT].item())
         if plan is not None and plan.get("replanned", None) is not None and bool(plan["replanned"].item()):
             if self.env.coordinates == 3:
@@ -220,17 +220,17 @@ class Roll:
         self.steps.append(row)
 
     def end(self, stepped: TensorDictBase, posture: np.ndarray[Any, Any]) -> None:
-        """Take in how the episode ended: the plan is the last one."""
+        """Add the end of the episode, with the last plan."""
         last, seen = self.steps[-1], self._seen(stepped["next"], posture)
         self.steps.append(last | {name: seen[name] for name in ("posture", "tool_pos", "target_pos", "measured_pos")})
 
     def recording(self, scenario: Scenario, **outcome: Any) -> Recording:
-        """All of it."""
+        """The finished recording."""
         columns = {name: np.stack([row[name] for row in self.steps]) for name in self.steps[0]}
         return Recording(scenario=scenario, look=self.look, insights=tuple(self.insights), **columns, **outcome)
 
     def _seen(self, seen: TensorDictBase, posture: np.ndarray[Any, Any]) -> dict[str, Any]:
-        """What a step shows of the world, and that nothing is planned."""
+        """A step's observations, with empty plan entries."""
         measured = seen.get(keys.MEASURED_POS, None)
         nowhere = np.full(3, np.nan)
         return {
@@ -247,7 +247,7 @@ class Roll:
         }
 
     def _believed(self, planned: TensorDictBase, true_pos: np.ndarray[Any, Any]) -> np.ndarray[Any, Any]:
-        """Where the planner takes the target to be, NaN where it sees the truth at ``true_pos`` (3)."""
+        """The planner's estimate of the target's position, NaN if it sees the true one, ``true_pos`` (3)."""
         planner = self.watch.planner
         if not isinstance(planner, TrackedPlanner):
             held = in_space(planned[keys.TARGET_POS][0])
@@ -258,12 +258,12 @@ class Roll:
 
 
 def grid_about(look: Look, coordinates: int) -> Tensor:
-    """Places ``(GRID², D)`` at equal distances in the level square about where the camera looks [m, world]."""
+    """Grid points ``(GRID², D)`` in the horizontal square around the camera's focus [m, world]."""
     side = torch.linspace(-look.half_side, look.half_side, GRID)
     level = torch.cartesian_prod(side + look.lookat[0], side + look.lookat[1])
     return torch.nn.functional.pad(level, (0, coordinates - 2))
 
 
 def in_space(place: Tensor) -> np.ndarray[Any, Any]:
-    """Places ``(*B, 3)`` of (*B, 2 or 3), those in a plane at height 0."""
+    """Positions ``(*B, 3)`` from (*B, 2 or 3), at height 0 for 2 coordinates."""
     return torch.nn.functional.pad(place, (0, 3 - place.shape[-1])).double().numpy()

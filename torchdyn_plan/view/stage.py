@@ -1,6 +1,6 @@
 # viser, mjviser and mujoco hide names from type checkers.
 # pyright: reportAttributeAccessIssue=false
-"""One recording in the browser: bodies of its world, its marks and its name, somewhere on the page."""
+"""One recording in the browser: bodies of its world, its layers and its name."""
 
 from __future__ import annotations
 
@@ -19,16 +19,16 @@ from torchdyn_plan.view.recording import Recording
 VISIBLE_GROUPS = 3
 """MuJoCo draws geoms of the groups below this one."""
 APART = 3.0
-"""Distance between the middles of two worlds side by side, in half sides of their squares."""
+"""Distance between the centres of two worlds side by side, in half sides of their squares."""
 LIFT = 1.3
-"""A planner's name stands so many half sides above the middle of its world."""
+"""Height of a planner's name above the centre of its world, in half sides."""
 
 
 class Stage:
-    """Draws a recording below one name of the page's tree of things."""
+    """Draws a recording under one name of the page's scene tree."""
 
     def __init__(self, server: Any, root: str, recording: Recording, place: np.ndarray[Any, Any]) -> None:
-        """Put everything that the recording needs below ``root``, moved by ``place`` (3) [m]."""
+        """Add everything that the recording needs under ``root``, shifted by ``place`` (3) [m]."""
         self.server, self.recording, look = server, recording, recording.look
         self._model, self._data = look.model, mujoco.MjData(look.model)
         self._root = server.scene.add_frame(root, show_axes=False, position=place)
@@ -54,7 +54,7 @@ class Stage:
         )
 
     def show(self, step: int, hidden: Collection[str] = ()) -> None:
-        """Bring everything to control step ``step``, without the layers ``hidden``; viser sends what has changed."""
+        """Show control step ``step`` without the layers ``hidden``; viser sends what has changed."""
         now = min(step, self.recording.length)
         self._data.qpos[:] = self.recording.posture[now]
         mujoco.mj_kinematics(self._model, self._data)
@@ -69,12 +69,12 @@ class Stage:
                     setattr(handle, entry, value)
 
     def remove(self) -> None:
-        """Take everything off the page."""
+        """Remove everything from the page."""
         self._root.remove()
 
 
 def as_batch(marks: Marks) -> dict[str, Any]:
-    """Sizes, colours and opacities as viser has them; what cannot be seen has no size."""
+    """Sizes, colours and opacities in viser's format; invisible marks have size 0."""
     opacity = marks.colours[:, 3].astype(np.float32)
     return {
         "batched_scales": (marks.sizes * (opacity > 0.0)[:, None]).astype(np.float32),
@@ -84,7 +84,7 @@ def as_batch(marks: Marks) -> dict[str, Any]:
 
 
 def body_meshes(model: mujoco.MjModel) -> dict[int, Any]:
-    """A mesh for each body of ``model`` that can be seen, in its own frame."""
+    """A mesh for each visible body of ``model``, in its own frame."""
     from mjviser.conversions import merge_geoms
 
     plain, found = with_plain_colours(model), {}
@@ -97,7 +97,7 @@ def body_meshes(model: mujoco.MjModel) -> dict[int, Any]:
 
 
 def with_plain_colours(model: mujoco.MjModel) -> mujoco.MjModel:
-    """A copy of ``model`` whose materials have the mean colour of their textures, which the page does not show."""
+    """A copy of ``model`` whose materials have the mean colour of their textures, because the page has no textures."""
     plain = copy.copy(model)
     for material in range(model.nmat):
         texture = int(model.mat_texid[material, mujoco.mjtTextureRole.mjTEXROLE_RGB])
@@ -110,7 +110,7 @@ def with_plain_colours(model: mujoco.MjModel) -> mujoco.MjModel:
 
 
 def camera_of(look: Look) -> tuple[np.ndarray[Any, Any], np.ndarray[Any, Any], np.ndarray[Any, Any]]:
-    """Where the look's camera stands, where it looks (3,) [m, world], and the direction to its right."""
+    """Position and focus of the look's camera (3,) [m, world], and the direction to its right."""
     azimuth, elevation = math.radians(look.azimuth), math.radians(look.elevation)
     level = np.array([math.cos(azimuth), math.sin(azimuth), 0.0])
     forward = math.cos(elevation) * level + np.array([0.0, 0.0, math.sin(elevation)])
@@ -119,6 +119,6 @@ def camera_of(look: Look) -> tuple[np.ndarray[Any, Any], np.ndarray[Any, Any], n
 
 
 def places_of(look: Look, count: int) -> list[np.ndarray[Any, Any]]:
-    """Where the middles of ``count`` worlds are put, side by side as the camera sees them: (3,) [m] each."""
+    """Centres of ``count`` worlds, placed side by side as seen by the camera: (3,) [m] each."""
     _, _, right = camera_of(look)
     return [(number - (count - 1) / 2) * APART * look.half_side * right for number in range(count)]

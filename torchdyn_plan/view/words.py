@@ -1,4 +1,4 @@
-"""What is said of a recording: at each control step, and at its end."""
+"""Texts about a recording: at each control step, and at its end."""
 
 from __future__ import annotations
 
@@ -9,12 +9,12 @@ STATUS = {
     PlanStatus.OK: "in time",
     PlanStatus.WAITING: "waits for its first plan",
     PlanStatus.UNREACHABLE: "cannot be in time anywhere",
-    PlanStatus.BAD_FORECAST: "forecast is of no use",
+    PlanStatus.BAD_FORECAST: "bad forecast",
     PlanStatus.TARGET_LOST: "target lost",
-    PlanStatus.BAD_INPUT: "input is no number",
+    PlanStatus.BAD_INPUT: "bad input",
     PlanStatus.NO_TRACK: "no track of the target",
 }
-"""What each status says in a few words."""
+"""A short text for each status."""
 
 
 def clock(recording: Recording, step: int) -> str:
@@ -23,7 +23,7 @@ def clock(recording: Recording, step: int) -> str:
 
 
 def plan_line(recording: Recording, step: int) -> str:
-    """How the plan stands: the countdown to the meeting, and the status."""
+    """State of the plan: the countdown to the meeting, and the status."""
     status = int(recording.status[step])
     if status == NOTHING:
         return "makes no plans"
@@ -35,7 +35,7 @@ def plan_line(recording: Recording, step: int) -> str:
 
 
 def outcome(recording: Recording) -> str:
-    """How the episode ended: when it was a success, or why not."""
+    """Outcome of the episode: the time of its success, or the cause of its failure."""
     after = clock(recording, recording.length)
     if recording.success:
         return f"{recording.scenario.task.words.success} after {after}"

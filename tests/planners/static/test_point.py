@@ -106,5 +106,5 @@ def test_a_limit_that_is_none_is_named(name):
 
 
 def test_a_state_without_velocity_is_named():
-    with pytest.raises(InputError, match="robot_state must begin with place and velocity, 6 numbers, got 3"):
+    with pytest.raises(InputError, match="robot_state must begin with position and velocity, 6 numbers, got 3"):
         PointArrival(**LIMITS).arrival(torch.zeros(2, 1, 3), torch.zeros(2, 4, 3))

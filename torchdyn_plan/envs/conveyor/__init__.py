@@ -1,4 +1,4 @@
-"""The world of conveyor: a Panda over a belt that carries parts past it."""
+"""The conveyor world: a Panda above a belt that carries parts past it."""
 
 from torchdyn_plan.envs.conveyor.env import ConveyorEnv
 from torchdyn_plan.envs.conveyor.panda import panda_arm

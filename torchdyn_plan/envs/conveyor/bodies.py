@@ -1,4 +1,4 @@
-"""What stands in a conveyor scene, as MuJoCo bodies: belt, parts, and the Panda with its suction cups."""
+"""MuJoCo bodies of a conveyor scene: belt, parts, and the Panda with its suction cups."""
 
 # mujoco hides its names from type checkers.
 # pyright: reportAttributeAccessIssue=false
@@ -16,13 +16,13 @@ if TYPE_CHECKING:
     from torchdyn_plan.envs.conveyor.scene import ConveyorScene
 
 BELT_LENGTH = 20.0
-"""Parts start upstream as far as their time needs [m]."""
+"""Long enough for parts to start as far upstream as their feed times require [m]."""
 BELT, PART = 1, 2
-"""Kinds of bodies that can touch one another."""
+"""Collision groups."""
 WHITE, GREY, DARK = (0.93, 0.93, 0.94, 1.0), (0.55, 0.57, 0.60, 1.0), (0.18, 0.19, 0.21, 1.0)
 COLOURS = ((0.84, 0.38, 0.12, 1.0), (0.12, 0.47, 0.71, 1.0), (0.20, 0.60, 0.30, 1.0), (0.75, 0.60, 0.10, 1.0))
 ARMATURE = 0.1
-"""Inertia of a motor behind its gear [kg·m²]."""
+"""Inertia of a motor, reflected through its gear [kg·m²]."""
 TOOL = "tool"
 
 
@@ -45,7 +45,7 @@ def add_look(spec: mujoco.MjSpec) -> None:
 
 
 def add_belt(spec: mujoco.MjSpec, scene: ConveyorScene, speed: float) -> None:
-    """A long box whose surface moves along y, and stripes beside it that do not."""
+    """A long box whose surface moves along y, with fixed stripes next to it."""
     box, half = mujoco.mjtGeom.mjGEOM_BOX, 0.5 * scene.belt_height
     spec.worldbody.add_geom(
         name="belt",
@@ -66,7 +66,7 @@ def add_belt(spec: mujoco.MjSpec, scene: ConveyorScene, speed: float) -> None:
 
 
 def add_parts(spec: mujoco.MjSpec, scene: ConveyorScene, count: int) -> None:
-    """``count`` boxes, each with a weld to the tool that is not active."""
+    """``count`` boxes, each with an inactive weld to the tool."""
     size = np.array(scene.part_size)
     for number in range(count):
         body = spec.worldbody.add_body(name=f"part{number}", pos=[scene.belt_x, -1.0 - number, scene.top])
@@ -95,9 +95,9 @@ def add_parts(spec: mujoco.MjSpec, scene: ConveyorScene, count: int) -> None:
 
 
 def add_panda(spec: mujoco.MjSpec, scene: ConveyorScene) -> None:
-    """Seven bodies whose joint frames are those of `PANDA_LINKS`, with capsules for looks, and the tool.
+    """Seven bodies with the joint frames of `PANDA_LINKS`, visual capsules, and the tool.
 
-    A servo is two actuators: one pulls to a position that runs on with the speed that is told, one to that speed.
+    A servo is two actuators: a position servo whose target moves at the commanded speed, and a speed servo.
     """
     capsule, cylinder = mujoco.mjtGeom.mjGEOM_CAPSULE, mujoco.mjtGeom.mjGEOM_CYLINDER
     look = {"contype": 0, "conaffinity": 0, "mass": 0.0}

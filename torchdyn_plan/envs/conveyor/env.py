@@ -1,4 +1,4 @@
-"""Conveyor as a TorchRL environment: a Panda takes parts off a belt that does not stop for it."""
+"""Conveyor as a TorchRL environment: a Panda picks parts off a moving belt."""
 
 from __future__ import annotations
 
@@ -24,21 +24,21 @@ if TYPE_CHECKING:
     import numpy as np
 
 TAKEN, PASSED = "taken", "passed"
-"""Flags: every part was taken; no part is left on the belt, and one at least was not taken."""
+"""Flags: every part was taken; no part is left on the belt, and at least one was not taken."""
 PARTS_TAKEN = "parts_taken"
 """Entry: which parts were taken, bool ``(N, K)``."""
 ROWS = 64
-"""Kinematics are computed for a multiple of so many arms."""
+"""Kinematics are computed for a multiple of this many arms."""
 CLOSEST = 0.12
-"""Parts follow one another at this distance at least, however slow the belt is [m]."""
+"""Smallest distance between parts, however slow the belt is [m]."""
 
 
 def draw_parts(
     scene: ConveyorScene, episodes: Tensor, *, parts: int, speed: float, split: str, seed: int
 ) -> tuple[Tensor, Tensor]:
-    """Where the parts of ``episodes`` (M,) start: x and y ``(M, K, 2)`` [m], and their turn ``(M, K)`` [rad], float64.
+    """Start of the parts of ``episodes`` (M,): x and y ``(M, K, 2)`` [m], and yaw ``(M, K)`` [rad], float64.
 
-    All of it is uniform: the first part's way upstream, the time from each part to the next, its lane and its turn.
+    All are uniform: the first part's position upstream, the time between parts, the position across the lane, the yaw.
     """
     drawn = draw_uniform(episodes, 3 * MOST_PARTS, split=split, seed=seed).view(-1, MOST_PARTS, 3)[:, :parts]
     share = 0.5 + 0.5 * drawn[..., 0]
@@ -50,17 +50,17 @@ def draw_parts(
 
 
 class ConveyorEnv(MovingTargetEnv):
-    """N Pandas with suction cups over a belt each, and K parts on it, turned about z.
+    """N Pandas with suction cups, each above a belt with K parts at any yaw.
 
-    The cups hold a part whose top is at their mouth, at its speed, and turned as it is, as `ConveyorScene` says in
-    numbers; a held part is welded to the tool. One that has been lifted off the belt is taken, and laid aside: where it
-    would be put down is no part of the task. An episode is a success when all its parts are taken (`TAKEN`), and ends
-    without it when what is left has gone by (`PASSED`).
+    The cups attach to a part when its top is at their mouth, at the same speed and orientation, within the limits of
+    `ConveyorScene`; the part is then welded to the tool. A part lifted off the belt is taken and removed: placing it is
+    not part of the task. An episode is a success when all its parts are taken (`TAKEN`), and fails when the remaining
+    parts have passed (`PASSED`).
 
-    ``targets_pos``, ``targets_history`` and ``targets_quat`` tell of all parts, and ``targets_present`` which of them
-    are still to be taken: parts that were taken or are gone leave their slots empty. A part is where the centre of its
-    top is. ``target_pos`` and its kin are of the part that is farthest downstream. ``robot_state`` is the joints'
-    positions and speeds [rad, rad/s] and the tool's place [m].
+    ``targets_pos``, ``targets_history`` and ``targets_quat`` cover all parts, and ``targets_present`` tells which are
+    still to be taken: parts that were taken or are gone leave their slots empty. A part's position is the centre of its
+    top. ``target_pos`` and the like are those of the part farthest downstream. ``robot_state`` is the joints' positions
+    and speeds [rad, rad/s] and the tool position [m].
     """
 
     flags = (TAKEN, PASSED)
@@ -86,11 +86,13 @@ class ConveyorEnv(MovingTargetEnv):
             series: as of `MovingTargetEnv`.
 
         Raises:
-            InputError: a number is out of range, or there is a sensor: one measures one target, and here all are seen.
+            InputError: a number is out of range, or a sensor is given: it handles one target only.
         """
         sensor = series.get("sensor")
         if isinstance(sensor, Sensor) and not sensor.is_exact:
-            raise InputError("sensor must be None: it measures one target, and the places of all parts are shown here")
+            raise InputError(
+                "sensor must be None: it measures one target, and this environment shows the positions of all parts"
+            )
         check_number("speed", speed, minimum=0.0, maximum=2.0)
         check_number("parts", parts, minimum=1, maximum=MOST_PARTS, integer=True)
         scene = ConveyorScene() if scene is None else scene
@@ -144,20 +146,20 @@ class ConveyorEnv(MovingTargetEnv):
         far = torch.where(present, places[..., 1], -torch.inf).argmax(-1)
         focus = torch.where(present.any(-1), far, self._focus)
         rows = (focus != self._focus).nonzero().squeeze(-1)
-        # The history that is shown is that of the part that is shown; the newest place is added to it later.
+        # The history shown is that of the part shown; the newest position is added later.
         self._trace[rows, 1:] = self._histories[rows, focus[rows]][:, :-1]
         self._focus = focus
         return places[torch.arange(self.num_envs), focus]
 
     def _grip(self, tool_vel: Tensor) -> None:
-        """Hold, take and give up parts, with tools that move with ``tool_vel`` (N, 3) [m/s]."""
+        """Attach, take and drop parts, with tools moving at ``tool_vel`` (N, 3) [m/s]."""
         scene, tops = self.scene, self._tops
         near = (tops - self._tool_pos.unsqueeze(1)).norm(dim=-1) <= scene.hold_distance
         near &= (self.simulation.part_vel - tool_vel.unsqueeze(1)).norm(dim=-1) <= scene.hold_speed
         near &= self._is_aligned & self.present & ~self._held.any(-1, keepdim=True)
         self._near = torch.where(near, self._near + 1, 0)
         new = self._near >= scene.hold_steps
-        # Never two parts at once.
+        # At most one part at a time.
         new &= new.long().cumsum(-1) == 1
         self.simulation.hold(new, self._tool_pos, self._tool_rotation)
         self._held = self._held | new
@@ -169,7 +171,7 @@ class ConveyorEnv(MovingTargetEnv):
 
     @property
     def _is_aligned(self) -> Tensor:
-        """Whether the tool looks down, and is turned as each part is, half a turn the same: ``(N, K)`` bool."""
+        """Whether the tool points down and is aligned with each part, up to a half turn: ``(N, K)`` bool."""
         least = math.cos(math.radians(self.scene.hold_angle))
         rotation = self._tool_rotation.double()
         down = -rotation[:, 2, 2] >= least
@@ -180,7 +182,7 @@ class ConveyorEnv(MovingTargetEnv):
 
     @property
     def present(self) -> Tensor:
-        """Parts that are still to be taken, ``(N, K)`` bool."""
+        """Parts still to be taken, ``(N, K)`` bool."""
         return ~self._taken & ~self._gone
 
     @property
@@ -190,8 +192,8 @@ class ConveyorEnv(MovingTargetEnv):
         return self.simulation.part_pos + up
 
     def _tool(self, joint_pos: Tensor) -> tuple[Tensor, Tensor]:
-        """Place (N, 3) [m] and rotation (N, 3, 3) of the cups' mouth at joint angles (N, 7) [rad]."""
-        # Matrix products treat the last few rows in another way, with another last bit: these are padding.
+        """Position (N, 3) [m] and rotation (N, 3, 3) of the cups' mouth at joint angles (N, 7) [rad]."""
+        # Matrix products may round the last few rows differently, so these rows are padding.
         pose = self._arm(nn.functional.pad(joint_pos.float(), (0, 0, 0, -self.num_envs % ROWS)))[: self.num_envs]
         return pose[:, :3, 3].clone(), pose[:, :3, :3].clone()
 
@@ -216,13 +218,13 @@ class ConveyorEnv(MovingTargetEnv):
         }
 
     def true_future(self, rows: Tensor, steps: int) -> Tensor:
-        """As of `MovingTargetEnv`: the belt carries the part on."""
+        """See `MovingTargetEnv`: the belt carries the part on."""
         now = self._trace[rows, -1]
         way = self.speed * self.scene.control_step * torch.arange(1, steps + 1, dtype=now.dtype)
         return now.unsqueeze(1) + nn.functional.pad(way.unsqueeze(-1), (1, 1))
 
     def look(self) -> Look:
-        """As of `MovingTargetEnv`: arm, belt and parts."""
+        """See `MovingTargetEnv`: arm, belt and parts."""
         return Look(self.simulation.model, lookat=(0.3, -0.05, 0.25), distance=1.9, azimuth=205.0)
 
     def posture(self, row: int) -> np.ndarray[Any, Any]:

@@ -32,7 +32,7 @@ class PandaLink:
     torque: float
     """Joint limit [N·m]."""
     mass: float
-    """[kg]: shares of the arm's 18 kg, by the links' sizes. Franka publishes the whole alone."""
+    """[kg]: shares of the arm's 18 kg by link size, because Franka publishes only the total."""
 
     @property
     def offset(self) -> Tensor:
@@ -55,11 +55,11 @@ PANDA_LINKS = tuple(
         (0.088, 0.0, QUARTER, (-2.8973, 2.8973), 2.61, 20.0, 12.0, 0.5),
     )
 )
-"""Franka Emika, "Robot and interface specifications": DH parameters, and the limits of the joints."""
+"""Franka Emika, "Robot and interface specifications": DH parameters and joint limits."""
 PANDA_FLANGE = 0.107
-"""The flange is so far from the last joint, along its axis [m]."""
+"""Distance of the flange from the last joint, along its axis [m]."""
 TOOL_TURN = -math.pi / 4
-"""Tools are mounted turned by this about the flange's axis, as Franka's own gripper is [rad]."""
+"""Mounting angle of tools about the flange's axis, as of Franka's own gripper [rad]."""
 
 
 def mount(tool_length: float) -> list[list[float]]:

@@ -1,4 +1,4 @@
-"""The scene of conveyor: a Panda, a belt, and parts on it, from one frozen dataclass."""
+"""The conveyor scene: a Panda, a belt, and parts on it, from one frozen dataclass."""
 
 # mujoco hides its names from type checkers.
 # pyright: reportAttributeAccessIssue=false
@@ -17,19 +17,19 @@ from torchdyn_plan.envs.conveyor.bodies import add_belt, add_look, add_panda, ad
 from torchdyn_plan.errors import InputError
 
 MOST_PARTS = 8
-"""Parts of an episode at most."""
+"""Most parts in an episode."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class ConveyorScene:
-    """Geometry and physics; the Panda stands in the world's origin, and the belt runs along y before it."""
+    """Geometry and physics; the Panda stands at the world's origin, and the belt runs along y in front of it."""
 
     belt_x: float = 0.45
     """Middle of the belt [m]."""
     belt_half_width: float = 0.2
     """[m]"""
     belt_height: float = 0.1
-    """Of its surface [m]."""
+    """Height of its surface [m]."""
     lane_half_width: float = 0.1
     """Parts lie within this of the belt's middle [m]."""
     part_size: tuple[float, float, float] = (0.09, 0.05, 0.04)
@@ -39,25 +39,25 @@ class ConveyorScene:
     first_from: float = -1.0
     """The first part of an episode starts no farther upstream than this [m]."""
     first_to: float = -0.4
-    """And no farther downstream [m]."""
+    """The first part of an episode starts no farther downstream than this [m]."""
     feed_from: float = 1.2
-    """Each part comes at least so long after the one before [s]."""
+    """Shortest time between two parts [s]."""
     feed_to: float = 2.4
-    """And at most so long [s]."""
+    """Longest time between two parts [s]."""
     gone_y: float = 0.65
-    """A part that has come so far is gone [m]."""
+    """A part this far downstream is gone [m]."""
     tool_length: float = 0.1
     """From the flange to the mouth of the suction cups [m]."""
     hold_distance: float = 0.012
-    """The cups hold a part whose top's centre is within this of their mouth [m] …"""
+    """The cups attach to a part if the centre of its top is within this distance of their mouth [m] …"""
     hold_speed: float = 0.1
-    """… at this speed beside it, or a lower one [m/s] …"""
+    """… at most at this relative speed [m/s] …"""
     hold_angle: float = 10.0
-    """… and turned as the part is, within this, half a turn the same [deg] …"""
+    """… and aligned with the part within this angle, up to a half turn [deg] …"""
     hold_steps: int = 3
-    """… for so many control steps on end."""
+    """… for this many consecutive control steps."""
     lift_height: float = 0.08
-    """A held part so far above the belt is taken [m]."""
+    """A held part this far above the belt is taken [m]."""
     home: tuple[float, ...] = (0.0, -0.2550, 0.0, -2.4366, 0.0, 2.1816, 0.7854)
     """Initial joint angles [rad]."""
     stiffness: tuple[float, ...] = (9000.0, 9000.0, 7000.0, 7000.0, 3000.0, 2500.0, 1500.0)
@@ -90,7 +90,7 @@ class ConveyorScene:
         return self.belt_height + self.part_size[2]
 
     def digest(self) -> str:
-        """Hash of every number above: two scenes with one digest are one scene."""
+        """Hash of every number above: scenes with equal digests are equal."""
         text = json.dumps(dataclasses.asdict(self), sort_keys=True)
         return hashlib.sha256(text.encode()).hexdigest()[:16]
 

@@ -11,7 +11,7 @@ from torchdyn_plan.envs.conveyor.scene import ConveyorScene
 from torchdyn_plan.kinematics.quaternions import matrix_quat, quat_multiply
 
 PARKED = (-0.7, 0.25)
-"""Where parts lie that were taken or are gone: x of them all, and how far they are apart along y [m]."""
+"""Where taken and gone parts are put: their x, and their spacing along y [m]."""
 
 
 class ConveyorSimulation:
@@ -20,7 +20,7 @@ class ConveyorSimulation:
     ``qpos`` (N, nq) holds MuJoCo's generalised positions, from which a scene can be drawn. ``joint_pos`` and
     ``joint_vel`` (N, 7) [rad, rad/s], ``part_pos``, ``part_quat`` and ``part_vel`` (N, K, …) [m, wxyz, m/s, world; of
     parts' centres] are views of the simulation: they change with every step, without copies. ``told_speed`` (N, 7) is
-    what the joints' servos were told last, within the limits of speed and acceleration [rad/s].
+    the last command to the joint servos, within the limits of speed and acceleration [rad/s].
     """
 
     def __init__(self, num_envs: int, scene: ConveyorScene, *, speed: float, parts: int, num_threads: int = 0) -> None:

@@ -1,4 +1,4 @@
-"""Conveyor: a base on wheels meets somebody who walks past, with nothing trained."""
+"""Conveyor: a Panda picks parts off a moving belt, with nothing trained."""
 
 from torchdyn_plan.tasks.conveyor.task import TASK
 

@@ -1,4 +1,4 @@
-"""Which parts can be taken at all: by a Panda that knows the belt, and whose joints go as fast as they may."""
+"""Which parts can be taken at all: by a Panda that knows the belt and moves at its joint limits."""
 
 from __future__ import annotations
 
@@ -17,11 +17,11 @@ from torchdyn_plan.planners.static.ik import IKPlanner
 from torchdyn_plan.tasks.task import Truth
 
 EVERY = 4
-"""Every so many control steps are looked at as moments of meeting."""
+"""Stride in control steps between candidate meetings."""
 BEYOND = 200
-"""Control steps for which parts are known beyond an episode's end, for planners that are shown the truth."""
+"""Control steps beyond an episode's end for which paths are computed, for planners that read the truth."""
 BLOCK = 256
-"""Parts that are looked at at once."""
+"""Parts computed at once."""
 
 
 def find_truth(settings: Any, *, episodes: int, seed: int, split: str, static: str = "", num_threads: int = 0) -> Truth:
@@ -37,12 +37,12 @@ def find_truth(settings: Any, *, episodes: int, seed: int, split: str, static: s
 
 
 def parts_solvable(scene: ConveyorScene, place: Tensor, yaw: Tensor, *, speed: float) -> Tensor:
-    """Whether parts that start at ``place`` (E, K, 2) [m], turned by ``yaw`` (E, K), can be met: ``(E, K)`` bool.
+    """Whether parts that start at ``place`` (E, K, 2) [m] with ``yaw`` (E, K) can be met: ``(E, K)`` bool.
 
-    A part can if at some control step, in time for the cups to take hold of it before it is gone and the episode is
-    over, it is where an arm that left its home at once can have its cups, turned as they need be, by then: by the
-    limits of its joints alone, on the straight way in joint space. What an arm needs beside, to come down with the
-    belt's speed, is not asked for: so no robot can take more.
+    A part can be met if, at some control step early enough for the cups to attach before the part is gone and the
+    episode is over, an arm that leaves its home pose at once can have its cups at the part, aligned with it, by the
+    limits of its joints and on a straight line in joint space. Matching the belt's velocity is not required, so this is
+    an upper bound.
     """
     arm = panda_arm(tool_length=scene.tool_length)
     limits: dict[str, Any] = {

@@ -1,4 +1,4 @@
-"""Conveyor as a task: what varies, its planners, and where everything else of it is defined."""
+"""Conveyor as a task: its settings, its planners, and where the rest is defined."""
 
 from __future__ import annotations
 
@@ -11,14 +11,14 @@ from torchdyn_plan.tasks.task import PlannerParts, Settings, Task, Truth, Verdic
 HORIZON = 200
 """Control steps that forecasts look ahead: four seconds."""
 REACH = (0.4, 0.45)
-"""Parts are met no farther upstream and downstream than this [m]: the tool goes along with them before and after."""
+"""Limits of meetings upstream and downstream [m]; the tool moves along with a part before and after."""
 MARGIN = 0.8
-"""Share of the joints' acceleration limits by which the static planner brakes: servos lag a little."""
+"""Share of the joints' acceleration limits used for braking, because the servos lag a little."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class ConveyorSettings(Settings):
-    """How fast the belt is, and how many parts there are."""
+    """Speed of the belt and number of parts."""
 
     speed: float = setting(
         0.35, text="Speed of the belt", unit="m/s", minimum=0.05, maximum=1.0, sweep=(0.1, 0.2, 0.35, 0.6, 0.8)
@@ -35,7 +35,7 @@ def scene() -> Any:
 
 
 def make_env(settings: ConveyorSettings, *, num_threads: int = 0, **batch: Any) -> Any:
-    """The environment at these settings; ``batch`` as `Task.make_env` says."""
+    """The environment at these settings; for ``batch`` see `Task.make_env`."""
     from torchdyn_plan.envs.conveyor.env import ConveyorEnv
 
     return ConveyorEnv(speed=settings.speed, parts=settings.parts, num_threads=num_threads, **batch)
@@ -49,7 +49,7 @@ def arm() -> Any:
 
 
 def ik(*, chunk: int | None = None, weights: Any = None) -> Any:
-    """Brings the cups to a pose, by the joints' limits."""
+    """Brings the cups to a pose within the joint limits."""
     from torchdyn_plan.envs.conveyor.panda import PANDA_LINKS
     from torchdyn_plan.planners import IKPlanner, TurnedToGoal
 
@@ -63,21 +63,21 @@ def ik(*, chunk: int | None = None, weights: Any = None) -> Any:
 
 
 def gain(*, chunk: int | None = None, weights: Any = None) -> Any:
-    """The same by a gain alone, for goals at rest: it lags behind one that moves."""
+    """The same with a gain only, for goals at rest: it lags behind a moving goal."""
     from torchdyn_plan.planners import IKPlanner, TurnedToGoal
 
     return IKPlanner(arm(), approach=TurnedToGoal(), control_step=scene().control_step, gain=0.1, chunk=chunk)
 
 
 def turn() -> Any:
-    """The cups are turned as the part is, half a turn the same: with the last joint as near to its middle as may be."""
+    """Aligns the cups with the part, up to a half turn, with the last joint as near to mid-range as possible."""
     from torchdyn_plan.planners import WithTarget
 
     return WithTarget(symmetry=2, facing=(1.0, 1.0, 0.0))
 
 
 def maneuver() -> Any:
-    """Hovers, comes down with the belt's speed, holds until the cups do, and lifts."""
+    """Hovers, descends at the belt's speed, holds until the cups attach, and lifts."""
     from torchdyn_plan.planners import MatchVelocity
 
     how: dict[str, Any] = {"along_by": 0.8, "down_after": 0.3, "early_steps": 12}
@@ -85,7 +85,7 @@ def maneuver() -> Any:
 
 
 def dynamic(parts: PlannerParts, forecaster: Any) -> Any:
-    """The planner for one part, on that forecast."""
+    """The planner for one part, with that forecaster."""
     from torchdyn_plan.planners import DynamicPlanner, MetWithin, ReplanSchedule
 
     own = maneuver()
@@ -103,40 +103,40 @@ def dynamic(parts: PlannerParts, forecaster: Any) -> Any:
 
 
 def forecaster() -> Any:
-    """The belt goes on as it does."""
+    """Constant velocity: exact on a belt."""
     from torchdyn_plan.nets import ConstantVelocity
 
     return ConstantVelocity(horizon=HORIZON, control_step=scene().control_step)
 
 
 def meet(parts: PlannerParts) -> Any:
-    """Takes the part that can be had soonest, then the next; nothing of it is trained."""
+    """Takes the part that can be met soonest, then the next; nothing is trained."""
     from torchdyn_plan.planners import ChoosingPlanner
 
     return ChoosingPlanner(dynamic(parts, forecaster())).eval()
 
 
 def first(parts: PlannerParts) -> Any:
-    """Takes the part that is farthest downstream, whatever comes behind it."""
+    """Takes the part farthest downstream, regardless of the others."""
     return dynamic(parts, forecaster())
 
 
 def pursuit(parts: PlannerParts) -> Any:
-    """Runs after the part that is farthest downstream."""
+    """Pursues the part farthest downstream."""
     from torchdyn_plan.planners import TargetPursuit
 
     return TargetPursuit(parts.static, turn=turn(), scene=scene().digest()).eval()
 
 
 def truth(settings: ConveyorSettings, **episodes: Any) -> Truth:
-    """As `Task.truth` says: solvable is what the joints' limits let an arm meet that knows the belt."""
+    """See `Task.truth`: a part is solvable if an arm that knows the belt can meet it within its joint limits."""
     from torchdyn_plan.tasks.conveyor.solvable import find_truth
 
     return find_truth(settings, **episodes)
 
 
 def judge(settings: ConveyorSettings, log: Any, truth: Truth) -> Verdict:
-    """As `Task.judge` says."""
+    """See `Task.judge`."""
     import torch
 
     cause = torch.where(truth.solvable, 1, 0).masked_fill(log.success, -1)
@@ -145,7 +145,7 @@ def judge(settings: ConveyorSettings, log: Any, truth: Truth) -> Verdict:
 
 TASK = Task(
     name="conveyor",
-    summary="A Panda takes parts off a belt.",
+    summary="A Panda picks parts off a belt.",
     settings=ConveyorSettings,
     words=Words(success="taken", steps="steps to take", target="part"),
     max_steps=500,
