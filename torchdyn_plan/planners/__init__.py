@@ -35,13 +35,16 @@ from torchdyn_plan.planners.static.ik import IKPlanner
 from torchdyn_plan.planners.static.point import PointPlanner
 from torchdyn_plan.planners.static.policy import PolicyPlanner
 from torchdyn_plan.planners.static.proportional import ProportionalController
-from torchdyn_plan.planners.track import KalmanTrack, LeastSquaresTrack, Track, TrackState
+from torchdyn_plan.planners.stay import GoAndStay
+from torchdyn_plan.planners.track import BallisticTrack, KalmanTrack, LeastSquaresTrack, Track, TrackState
 from torchdyn_plan.planners.tracked import TrackedPlanner
-from torchdyn_plan.planners.turn import Turn, WithTarget
+from torchdyn_plan.planners.turn import AgainstVelocity, Turn, WithTarget
 
 __all__ = [
+    "AgainstVelocity",
     "Approach",
     "Background",
+    "BallisticTrack",
     "CallablePlanner",
     "ChoosingPlanner",
     "Commits",
@@ -52,6 +55,7 @@ __all__ = [
     "EndOfForecast",
     "EventSchedule",
     "ExactSearch",
+    "GoAndStay",
     "GoTo",
     "GoalSearch",
     "IKPlanner",

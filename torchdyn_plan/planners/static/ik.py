@@ -232,7 +232,8 @@ class IKPlanner(Precise, StaticPlannerModule):
         for _ in range(GOAL_STEPS):
             pose, jacobian = self.arm.pose_and_jacobian(q)
             error = self._way(pose, goal)
-            step = limited_step(dls_step(jacobian[..., : error.shape[-1], :], error, GOAL_DAMPING), longest, 1.0)
+            rows = self._rows(pose, jacobian, error.shape[-1])
+            step = limited_step(dls_step(rows, error, GOAL_DAMPING), longest, 1.0)
             q = torch.clamp(q + step, self.arm.lower, self.arm.upper)
         way = self._way(self.arm(q), goal)
         left = way[..., :3].norm(dim=-1)
@@ -245,6 +246,16 @@ class IKPlanner(Precise, StaticPlannerModule):
     def _way(self, pose: Tensor, goal: Tensor) -> Tensor:
         """The twist still to go from poses (R, 4, 4) to goals (R, 3 or 7)."""
         return torch.stack(self.approach.twist(pose[..., :3, :].flatten(-2).unbind(-1), goal.unbind(-1)), dim=-1)
+
+    def _rows(self, pose: Tensor, jacobian: Tensor, count: int) -> Tensor:
+        """The first ``count`` rows of ``jacobian`` (*B, 6, N), of which a tool that is round may turn as it likes."""
+        rows = jacobian if count == 6 else jacobian[..., :count, :]
+        if getattr(self.approach, "symmetry", 1) != 0:
+            return rows
+        # No joint works against a turn about the tool's own axis.
+        axis = pose[..., :3, 2].unsqueeze(-1)
+        move, turn = rows[..., :3, :], rows[..., 3:, :]
+        return torch.cat([move, turn - axis * (axis * turn).sum(-2, keepdim=True)], dim=-2)
 
     def step(self, joint_pos: Tensor, goal: Tensor, before: Tensor | None = None) -> tuple[Tensor, Tensor]:
         """One step of the path from ``joint_pos`` (*B, N) [rad] towards ``goal`` (*B, 3) [m, world].
@@ -278,7 +289,7 @@ class IKPlanner(Precise, StaticPlannerModule):
         moves = moved[..., :3].norm(dim=-1, keepdim=True) <= GOAL_SPEED * self.control_step
         along = torch.where(moves, moved, 0.0)
         low, high = self.arm.lower - joint_pos, self.arm.upper - joint_pos
-        rows = jacobian[..., : error.shape[-1], :]
+        rows = self._rows(pose, jacobian, error.shape[-1])
         ways = [self._within(dls_step(rows, way, self.damping), rows, way, low, high) for way in (error - along, along)]
         step = limited_step(braked_step(ways[0], self._limit, self._brake) + ways[1], self._limit, 1.0)
         step = torch.clamp(step, low, high)
@@ -292,7 +303,7 @@ class IKPlanner(Precise, StaticPlannerModule):
     def _step_from(self, joint_pos: Tensor, goal: Tensor, pose: Tensor, jacobian: Tensor) -> tuple[Tensor, Tensor]:
         """`step` where the tool's pose and Jacobian are known."""
         error = torch.stack(self.approach.twist(pose.flatten(-2).unbind(-1), goal.unbind(-1)), dim=-1)
-        rows = jacobian if error.shape[-1] == 6 else jacobian[..., : error.shape[-1], :]
+        rows = self._rows(pose, jacobian, error.shape[-1])
         # A module's attribute that is a buffer takes as long to look up as a small operation; its table does not.
         limit, bounds = cast(Tensor, self._buffers["_limit"]), cast(dict[str, Tensor], self.arm._buffers)
         low, high = bounds["lower"] - joint_pos, bounds["upper"] - joint_pos
