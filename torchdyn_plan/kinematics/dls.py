@@ -8,6 +8,8 @@ from torch import Tensor
 from torchdyn_plan.precision import autocast_is_on, without_autocast
 
 QUARTER_TURN = math.pi / 2
+NEXT_TO_NOTHING = 1e-5
+"""A way that is no longer than this share of what a step can change by needs no braking."""
 
 
 def dls_step(jacobian: Tensor, error: Tensor, damping: float | Tensor, *, preferred: Tensor | None = None) -> Tensor:
@@ -75,8 +77,9 @@ def braked_step(step: Tensor, limit: Tensor, brake: Tensor) -> Tensor:
     """
     way = step.abs()
     allowed = ((brake.square() + 2.0 * brake * way).sqrt() - brake).minimum(limit)
-    share = (allowed / way.clamp_min(1e-12)).amin(dim=-1, keepdim=True)
-    return step * share.clamp(max=1.0)
+    # Of a joint that has next to nothing to go rounding alone is left: it holds up no other.
+    share = torch.where(way <= NEXT_TO_NOTHING * brake, 1.0, allowed / way.clamp_min(1e-12))
+    return step * share.amin(dim=-1, keepdim=True).clamp(max=1.0)
 
 
 def dls_step_within(  # noqa: PLR0917  # As of `dls_step`, and the limits.
