@@ -41,7 +41,7 @@ FITTED = {
 }
 """Networks that are fitted to data, and what ``--help`` says of them."""
 
-TRACKS = ("none", "least_squares", "kalman")
+TRACKS = ("none", "least_squares", "kalman", "ballistic")
 """Tracks by name; tests hold them against `torchdyn_plan.evaluation.tracks`, which takes long to import."""
 LAYERS = ("region", "trail", "forecast", "candidates", "goal", "measurements", "track", "tool", "target")
 """What is drawn beside a world; tests hold them against `torchdyn_plan.view.marks`, which takes long to import."""

@@ -116,9 +116,7 @@ class ConstantVelocity(AnalyticForecast):
 class Ballistic(AnalyticForecast):
     """The target flies: it falls with a constant acceleration, and the air slows it down where it has a ``drag``."""
 
-    def __init__(
-        self, *, gravity: Sequence[float] = (0.0, 0.0, -9.81), drag: float = 0.0, **settings: Any
-    ) -> None:
+    def __init__(self, *, gravity: Sequence[float] = (0.0, 0.0, -9.81), drag: float = 0.0, **settings: Any) -> None:
         """Fall, and be slowed down.
 
         Args:

@@ -147,7 +147,12 @@ class Track(ABC):
 
     def told(self) -> dict[str, Any]:
         """Its kind, and every number by name, for files."""
-        return {"kind": type(self).__name__} | dataclasses.asdict(self)
+        # As JSON has it: what is read from a file is compared with it.
+        own = (
+            (name, list(value) if isinstance(value, tuple) else value)
+            for name, value in dataclasses.asdict(self).items()
+        )
+        return {"kind": type(self).__name__} | dict(own)
 
     @property
     def order(self) -> int:

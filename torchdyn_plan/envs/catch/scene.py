@@ -56,9 +56,9 @@ class CatchScene:
     """… no lower than this [m] …"""
     throw_high: float = 1.8
     """… and no higher [m]."""
-    aim_low: tuple[float, float, float] = (0.5, -0.6, 0.8)
+    aim_low: tuple[float, float, float] = (0.45, -0.8, 0.7)
     """Balls fly through a place in a box: its least coordinates [m, world] …"""
-    aim_high: tuple[float, float, float] = (0.9, 0.6, 1.5)
+    aim_high: tuple[float, float, float] = (0.95, 0.8, 1.6)
     """… and its greatest ones [m, world]."""
     flight_spread: float = 0.2
     """The time of flight to that place differs by so much at most from the mean [s]."""
@@ -72,7 +72,7 @@ class CatchScene:
     """Physics step [s]."""
     control_step: float = 0.008
     """Time between two actions [s]: the UR10's own 125 Hz."""
-    max_steps: int = 190
+    max_steps: int = 220
     """Control steps of an episode."""
 
     def __post_init__(self) -> None:

@@ -129,7 +129,7 @@ TASK = Task(
     summary="A UR10 with a cup meets a thrown ball in the air.",
     settings=CatchSettings,
     words=Words(success="caught", steps="steps to hold", target="ball"),
-    max_steps=190,
+    max_steps=220,
     control_step=0.008,
     make_env=make_env,
     digest=lambda: scene().digest(),
