@@ -9,7 +9,7 @@ from torchdyn_plan.precision import autocast_is_on, without_autocast
 
 QUARTER_TURN = math.pi / 2
 NEXT_TO_NOTHING = 1e-5
-"""A way that is no longer than this share of what a step can change by needs no braking."""
+"""Of a way shorter than this share of what a step can change by the braked step is taken from its series."""
 
 
 def dls_step(jacobian: Tensor, error: Tensor, damping: float | Tensor, *, preferred: Tensor | None = None) -> Tensor:
@@ -77,8 +77,9 @@ def braked_step(step: Tensor, limit: Tensor, brake: Tensor) -> Tensor:
     """
     way = step.abs()
     allowed = ((brake.square() + 2.0 * brake * way).sqrt() - brake).minimum(limit)
-    # Of a joint that has next to nothing to go rounding alone is left: it holds up no other.
-    share = torch.where(way <= NEXT_TO_NOTHING * brake, 1.0, allowed / way.clamp_min(1e-12))
+    # Where next to nothing is left to go, the difference is rounding alone, and would hold up the other joints.
+    small = way <= NEXT_TO_NOTHING * brake
+    share = torch.where(small, 1.0 - 0.5 * way / brake, allowed / way.clamp_min(1e-12))
     return step * share.amin(dim=-1, keepdim=True).clamp(max=1.0)
 
 

@@ -398,7 +398,7 @@ class KalmanTrack(Track):
 
 @dataclass(frozen=True, kw_only=True)
 class BallisticTrack(Track):
-    """The Kalman filter of a target that flies: it falls with gravity, but for what else accelerates it, as drag does."""
+    """The Kalman filter of a target that falls with gravity, but for what else accelerates it, as drag does."""
 
     gravity: tuple[float, ...] = (0.0, 0.0, -9.81)
     """Acceleration that is expected, a number for each axis [m/s², world]."""

@@ -35,7 +35,7 @@ class CatchEnv(MovingTargetEnv):
     centre has been inside the cup for `CatchScene.hold_steps` control steps on end (`CAUGHT`), and missed when it
     touches the floor (`MISSED`). Its path is a pure function of the episode until something touches it.
 
-    ``tool_pos`` is the middle of the cup's mouth, and the tool's z axis points out of it. ``robot_state`` is the joints'
+    ``tool_pos`` is the middle of the cup's mouth, out of which the tool's z axis points. ``robot_state`` is the joints'
     positions and speeds [rad, rad/s] and the tool's place [m].
     """
 
