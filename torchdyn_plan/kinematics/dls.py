@@ -8,8 +8,6 @@ from torch import Tensor
 from torchdyn_plan.precision import autocast_is_on, without_autocast
 
 QUARTER_TURN = math.pi / 2
-NEXT_TO_NOTHING = 1e-5
-"""Of a way shorter than this share of what a step can change by the braked step is taken from its series."""
 
 
 def dls_step(jacobian: Tensor, error: Tensor, damping: float | Tensor, *, preferred: Tensor | None = None) -> Tensor:
@@ -63,7 +61,7 @@ def limited_step(step: Tensor, limit: Tensor, gain: float) -> Tensor:
     return step * torch.clamp(1.0 / worst.clamp_min(1e-12), max=gain)
 
 
-def braked_step(step: Tensor, limit: Tensor, brake: Tensor) -> Tensor:
+def braked_step(step: Tensor, limit: Tensor, brake: Tensor, *, idle: Tensor | None = None) -> Tensor:
     """Shorten ``step`` (*B, N) so that every joint can still stop where the whole of it leads, all in proportion.
 
     A joint that goes u in a control step and then brakes stops after u + u²/2b, with b what it can change its step by:
@@ -74,12 +72,13 @@ def braked_step(step: Tensor, limit: Tensor, brake: Tensor) -> Tensor:
         step: ``(*B, N)``, the way e that is left.
         limit: ``(N,)``, the most that a joint moves in a control step.
         brake: ``(N,)``, the most that this changes by from one step to the next.
+        idle: ``(*B, N)`` bool: joints that take no part, and hold up no other; None for none.
     """
     way = step.abs()
     allowed = ((brake.square() + 2.0 * brake * way).sqrt() - brake).minimum(limit)
-    # Where next to nothing is left to go, the difference is rounding alone, and would hold up the other joints.
-    small = way <= NEXT_TO_NOTHING * brake
-    share = torch.where(small, 1.0 - 0.5 * way / brake, allowed / way.clamp_min(1e-12))
+    share = allowed / way.clamp_min(1e-12)
+    if idle is not None:
+        share = share.masked_fill(idle, 1.0)
     return step * share.amin(dim=-1, keepdim=True).clamp(max=1.0)
 
 

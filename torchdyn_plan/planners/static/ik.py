@@ -51,6 +51,8 @@ TURN_TOLERANCE = 0.05
 """The same of how it is turned [rad]."""
 GOAL_SPEED = 2.0
 """A goal that is another one than a step before, nearer than this speed explains, moves; else it is a new one [m/s]."""
+IDLE = 1e-8
+"""A joint whose part of the Jacobian has a smaller square than this does nothing for the tool."""
 PATH_NAMES = tuple(f"path_{field}" for field in Path._fields)
 
 
@@ -247,10 +249,15 @@ class IKPlanner(Precise, StaticPlannerModule):
         """The twist still to go from poses (R, 4, 4) to goals (R, 3 or 7)."""
         return torch.stack(self.approach.twist(pose[..., :3, :].flatten(-2).unbind(-1), goal.unbind(-1)), dim=-1)
 
+    @property
+    def _is_round(self) -> bool:
+        """Whether the tool is the same however it is turned about its z axis."""
+        return getattr(self.approach, "symmetry", 1) == 0
+
     def _rows(self, pose: Tensor, jacobian: Tensor, count: int) -> Tensor:
         """The first ``count`` rows of ``jacobian`` (*B, 6, N), of which a tool that is round may turn as it likes."""
         rows = jacobian if count == 6 else jacobian[..., :count, :]
-        if getattr(self.approach, "symmetry", 1) != 0:
+        if not self._is_round:
             return rows
         # No joint works against a turn about the tool's own axis.
         axis = pose[..., :3, 2].unsqueeze(-1)
@@ -291,7 +298,9 @@ class IKPlanner(Precise, StaticPlannerModule):
         low, high = self.arm.lower - joint_pos, self.arm.upper - joint_pos
         rows = self._rows(pose, jacobian, error.shape[-1])
         ways = [self._within(dls_step(rows, way, self.damping), rows, way, low, high) for way in (error - along, along)]
-        step = limited_step(braked_step(ways[0], self._limit, self._brake) + ways[1], self._limit, 1.0)
+        # Of a round tool the last joint may have nothing to do at all.
+        idle = rows.square().sum(-2) < IDLE if self._is_round else None
+        step = limited_step(braked_step(ways[0], self._limit, self._brake, idle=idle) + ways[1], self._limit, 1.0)
         step = torch.clamp(step, low, high)
         return (step / self._limit).clamp(-1.0, 1.0), joint_pos + step
 
