@@ -18,7 +18,7 @@ if TYPE_CHECKING:
 FLOOR, CUP, BALL = 1, 2, 4
 """Kinds of things that can touch one another: the ball touches the others, and nothing else touches anything."""
 SILVER, BLUE, GREY = (0.73, 0.75, 0.77, 1.0), (0.33, 0.53, 0.70, 1.0), (0.45, 0.47, 0.50, 1.0)
-FELT, FOAM = (0.80, 0.88, 0.25, 1.0), (0.84, 0.38, 0.12, 0.55)
+FELT, FOAM = (0.75, 0.85, 0.10, 1.0), (0.84, 0.38, 0.12, 0.45)
 ARMATURE = 0.1
 """Inertia of a motor behind its gear [kg·m²]."""
 STAVES = 16
@@ -35,10 +35,12 @@ def add_look(spec: mujoco.MjSpec) -> None:
     visual.headlight.ambient, visual.headlight.diffuse = [0.4] * 3, [0.35] * 3
     sun: dict[str, Any] = {"type": mujoco.mjtLightType.mjLIGHT_DIRECTIONAL, "castshadow": True}
     spec.worldbody.add_light(pos=[1.5, -1.0, 4.0], dir=[-0.2, 0.15, -1], diffuse=[0.55] * 3, **sun)
-    plane = mujoco.mjtGeom.mjGEOM_PLANE
-    spec.worldbody.add_geom(
-        name="floor", type=plane, size=[30, 30, 0.1], rgba=[0.80, 0.81, 0.80, 1], contype=FLOOR, conaffinity=BALL
-    )
+    chequered = {"type": mujoco.mjtTexture.mjTEXTURE_2D, "builtin": mujoco.mjtBuiltin.mjBUILTIN_CHECKER}
+    spec.add_texture(name="floor", width=256, height=256, rgb1=[0.80] * 3, rgb2=[0.74] * 3, **chequered)
+    floor = spec.add_material(name="floor", texrepeat=[1, 1], texuniform=True)
+    floor.textures[mujoco.mjtTextureRole.mjTEXROLE_RGB] = "floor"
+    plane = {"type": mujoco.mjtGeom.mjGEOM_PLANE, "size": [30, 30, 0.1], "material": "floor"}
+    spec.worldbody.add_geom(name="floor", contype=FLOOR, conaffinity=BALL, **plane)
 
 
 def add_ball(spec: mujoco.MjSpec, scene: CatchScene, drag: float) -> None:

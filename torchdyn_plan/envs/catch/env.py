@@ -140,7 +140,7 @@ class CatchEnv(MovingTargetEnv):
 
     def look(self) -> Look:
         """As of `MovingTargetEnv`: arm, cup and ball."""
-        return Look(self.simulation.model, lookat=(1.2, 0.0, 1.0), distance=4.2, azimuth=115.0, elevation=-14.0)
+        return Look(self.simulation.model, lookat=(1.35, 0.1, 1.15), distance=3.4, azimuth=120.0, elevation=-14.0)
 
     def posture(self, row: int) -> np.ndarray[Any, Any]:
         """As of `MovingTargetEnv`."""

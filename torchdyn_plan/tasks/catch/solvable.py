@@ -11,7 +11,6 @@ from torchdyn_plan.envs.catch.env import draw_throws
 from torchdyn_plan.envs.catch.scene import GRAVITY, CatchScene
 from torchdyn_plan.envs.catch.ur10 import UR10_LINKS, ur10_arm
 from torchdyn_plan.kinematics.flight import fly
-from torchdyn_plan.nets.analytic_arrival import AnalyticArrival
 from torchdyn_plan.planners.static.approach import TurnedToGoal
 from torchdyn_plan.planners.static.ik import IKPlanner
 from torchdyn_plan.planners.turn import AgainstVelocity
@@ -40,26 +39,29 @@ def flights_solvable(scene: CatchScene, future: Tensor) -> Tensor:
     """Whether balls that fly along ``future`` (E, T, 3) [m, world], from their start on, can be met: ``(E,)`` bool.
 
     A ball can if at some control step before it touches the floor it is where an arm that left its home at once can
-    have its cup at rest by then, against the ball's velocity: by the limits of its joints alone, on the straight way in
-    joint space, from a flight that is known from the start.
+    have its cup by then, against the ball's velocity, without stopping there: by the limits of its joints alone, on
+    the straight way in joint space, from a flight that is known from the start.
     """
-    arm = ur10_arm(tool_length=scene.tool_length)
     base_pos = (0.0, 0.0, scene.base_height)
-    joints = IKPlanner(arm, approach=TurnedToGoal(base_pos=base_pos, symmetry=0), control_step=scene.control_step)
-    limits: dict[str, Any] = {
-        "speed": [link.speed for link in UR10_LINKS],
-        "acceleration": [link.acceleration for link in UR10_LINKS],
-    }
-    eta = AnalyticArrival(joints, **limits, control_step=scene.control_step)
-    state = torch.tensor([*scene.home, *[0.0] * len(UR10_LINKS)])
+    approach = TurnedToGoal(base_pos=base_pos, symmetry=0)
+    joints = IKPlanner(ur10_arm(tool_length=scene.tool_length), approach=approach, control_step=scene.control_step)
+    speed = torch.tensor([link.speed for link in UR10_LINKS])
+    acceleration = torch.tensor([link.acceleration for link in UR10_LINKS])
+    home = torch.tensor(scene.home)
     steps = torch.arange(EVERY, scene.max_steps - scene.hold_steps, EVERY)
     found = []
     for path in future.split(BLOCK):
         turn = AgainstVelocity()(path[:, 1:], path[:, 0], path[:, :1].expand(-1, 2, 3))
         goal = torch.cat([path[:, steps], turn[:, steps - 1]], dim=-1)
         with torch.no_grad():
-            arrival = eta.arrival(state.expand(len(goal), 1, -1), goal)
-        in_time = (arrival.steps <= steps) & ~arrival.never
+            there, reached = joints.goal_joints(home.expand(len(goal), 1, -1), goal)
+        time = passing_time((there - home).abs(), speed, acceleration).amax(-1)
         in_the_air = path[:, steps, 2] > scene.ball_radius
-        found.append((in_time & in_the_air).any(-1))
+        found.append((reached & in_the_air & (time <= scene.control_step * steps)).any(-1))
     return torch.cat(found)
+
+
+def passing_time(way: Tensor, speed: Tensor, acceleration: Tensor) -> Tensor:
+    """Least time from rest until joints have gone ``way`` (*B, N), by limits (N,), at whatever speed: ``(*B, N)`` [s]."""
+    ramp = 0.5 * speed.square() / acceleration
+    return torch.where(way <= ramp, (2.0 * way / acceleration).sqrt(), (way + ramp) / speed)

@@ -81,8 +81,8 @@ def dynamic(parts: PlannerParts, forecaster: Any) -> Any:
     return DynamicPlanner(
         parts.static,
         forecaster,
-        search=ExactSearch(stride=2, first=2, margin=2.0, switching_cost=0.1),
-        schedule=ReplanSchedule.every(2),
+        search=ExactSearch(stride=2, first=2, margin=10.0, switching_cost=0.1),
+        schedule=ReplanSchedule.every(6),
         maneuver=GoAndStay(before=3),
         turn=AgainstVelocity(),
         chunk=parts.chunk,
@@ -110,7 +110,7 @@ def pursuit(parts: PlannerParts) -> Any:
 
 
 def truth(settings: CatchSettings, **episodes: Any) -> Truth:
-    """As `Task.truth` says: solvable is what the joints' limits let an arm meet that knows the flight."""
+    """As `Task.truth` says: solvable is what the joints' limits let an arm reach that knows the flight."""
     from torchdyn_plan.tasks.catch.solvable import find_truth
 
     return find_truth(settings, **episodes)
