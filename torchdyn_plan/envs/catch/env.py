@@ -140,7 +140,7 @@ class CatchEnv(MovingTargetEnv):
 
     def look(self) -> Look:
         """As of `MovingTargetEnv`: arm, cup and ball."""
-        return Look(self.simulation.model, lookat=(1.35, 0.1, 1.15), distance=3.4, azimuth=120.0, elevation=-14.0)
+        return Look(self.simulation.model, lookat=(1.5, 0.1, 1.2), distance=3.6, azimuth=120.0, elevation=-14.0)
 
     def posture(self, row: int) -> np.ndarray[Any, Any]:
         """As of `MovingTargetEnv`."""
