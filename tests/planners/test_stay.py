@@ -52,7 +52,17 @@ def test_what_is_no_meeting_does_not_keep_it(why):
     torch.testing.assert_close(found[-1], HERE + 2)
 
 
-@pytest.mark.parametrize("settings", [{"before": -1}, {"steps": 0}, {"steps": 1.5}])
+def test_a_target_that_is_there_keeps_it_whatever_its_plan_was():
+    near = torch.tensor([[0.05, 0.0, 0.0], [0.2, 0.0, 0.0]])
+    maneuver, observed = GoAndStay(within=0.1), seen()._replace(target_pos=HERE + near)
+    state, found = maneuver.start(observed), []
+    for number in range(3):
+        goal, state = maneuver(plan([9, 9], HERE + number, reachable=False), observed, torch.zeros(2).bool(), state)
+        found.append(goal - HERE)
+    torch.testing.assert_close(torch.stack(found)[:, :, 0], torch.tensor([[0.0, 0.0], [0.0, 1.0], [0.0, 2.0]]))
+
+
+@pytest.mark.parametrize("settings", [{"before": -1}, {"within": -0.1}, {"steps": 0}, {"steps": 1.5}])
 def test_settings_that_cannot_be_are_refused(settings):
     with pytest.raises(InputError, match=next(iter(settings))):
         GoAndStay(**settings)

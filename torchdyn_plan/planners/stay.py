@@ -24,7 +24,7 @@ class StayState(NamedTuple):
 
 @dataclass(frozen=True, kw_only=True)
 class GoAndStay:
-    """Goes to the meeting place, and keeps to it from shortly before the meeting on.
+    """Goes to the meeting place, and keeps to it from shortly before the meeting on, or from when the target is there.
 
     Plans that are made when a target has been met are of no use: it no longer moves as it did.
     """
@@ -33,11 +33,14 @@ class GoAndStay:
 
     before: int = 3
     """Control steps before the meeting from which on it stays: more than the `first` step of the search."""
+    within: float = 0.0
+    """A target within this distance of the tool has come, even if the robot was to be late by its plan [m]."""
     steps: int = 100
     """Control steps for which it stays; it is free to meet the target again after them."""
 
     def __post_init__(self) -> None:
         check_number("before", self.before, minimum=0, integer=True)
+        check_number("within", self.within, minimum=0.0)
         check_number("steps", self.steps, minimum=1, integer=True)
 
     @property
@@ -56,7 +59,9 @@ class GoAndStay:
     ) -> tuple[Tensor, StayState]:
         """The plan's goal, or the one at which it stays."""
         left = (state.stay_left - 1).clamp_min(0)
-        begins = (left == 0) & plan.reachable & (plan.age >= 0) & ~holds & (plan.arrival_steps <= self.before)
+        away = torch.linalg.vector_norm(observation.target_pos - observation.tool_pos, dim=-1)
+        comes = (plan.reachable & (plan.arrival_steps <= self.before)) | (away < self.within)
+        begins = (left == 0) & comes & (plan.age >= 0) & ~holds
         left = left.masked_fill(begins, self.steps)
         size = plan.goal.shape[-1]
         new = torch.nn.functional.pad(plan.goal, (0, 7 - size))

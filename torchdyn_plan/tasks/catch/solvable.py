@@ -62,6 +62,6 @@ def flights_solvable(scene: CatchScene, future: Tensor) -> Tensor:
 
 
 def passing_time(way: Tensor, speed: Tensor, acceleration: Tensor) -> Tensor:
-    """Least time in which joints go ``way`` (*B, N) from rest, by limits (N,), and pass at any speed: ``(*B, N)`` [s]."""
+    """Least time from rest until joints have gone ``way`` (*B, N), by limits (N,), without a stop: ``(*B, N)`` [s]."""
     ramp = 0.5 * speed.square() / acceleration
     return torch.where(way <= ramp, (2.0 * way / acceleration).sqrt(), (way + ramp) / speed)

@@ -83,7 +83,7 @@ def dynamic(parts: PlannerParts, forecaster: Any) -> Any:
         forecaster,
         search=ExactSearch(stride=2, first=2, margin=10.0, switching_cost=0.1),
         schedule=ReplanSchedule.every(6),
-        maneuver=GoAndStay(before=3),
+        maneuver=GoAndStay(before=3, within=0.12),
         turn=AgainstVelocity(),
         chunk=parts.chunk,
         scene=scene().digest(),
