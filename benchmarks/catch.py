@@ -28,9 +28,9 @@ TRACKS = {"ballistic": {}, "kalman": {"accelerates": True, "acceleration": 10.0}
 class Arguments(Episodes):
     """Catch balls."""
 
-    planners: tuple[str, ...] = ("pursuit", "meet", "oracle")
+    planners: tuple[str, ...] = ("meet", "pursuit", "oracle")
     """Planners of the task; the oracle knows the flight, whatever is measured."""
-    sensors: tuple[str, ...] = ("exact", "3 mm, 60 Hz")
+    sensors: tuple[str, ...] = ("3 mm, 60 Hz", "exact")
     """By name."""
     tracks: tuple[str, ...] = ("ballistic",)
     """By name."""
@@ -40,7 +40,7 @@ class Arguments(Episodes):
     """Of the ball [1/m]."""
     episodes: int = 500
     """Episodes for each row."""
-    num_envs: int = 100
+    num_envs: int = 250
     """Episodes side by side; does not change the figures."""
     split: str = "test"
     """Series of episodes: test, or dev while tuning."""
