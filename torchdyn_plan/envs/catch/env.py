@@ -101,8 +101,8 @@ class CatchEnv(MovingTargetEnv):
             self.simulation.place_balls(held)
         else:
             self._inside = torch.where(self.is_inside, self._inside + 1, 0)
-            floor = self.scene.ball_radius + self.scene.ball_radius / 2
-            self._is_down = self._is_down | (self.simulation.ball_pos[:, 2] <= floor)
+            # Between two control steps a ball may touch the floor and leave it again.
+            self._is_down = self._is_down | (self.simulation.ball_pos[:, 2] <= 1.5 * self.scene.ball_radius)
         return self.simulation.ball_pos.float()
 
     @property

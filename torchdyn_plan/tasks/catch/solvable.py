@@ -7,8 +7,8 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from torchdyn_plan.envs.catch.env import draw_throws
 from torchdyn_plan.envs.catch.scene import GRAVITY, CatchScene
+from torchdyn_plan.envs.catch.throws import draw_throws
 from torchdyn_plan.envs.catch.ur10 import UR10_LINKS, ur10_arm
 from torchdyn_plan.kinematics.flight import fly
 from torchdyn_plan.planners.static.approach import TurnedToGoal
