@@ -89,13 +89,16 @@ class AgainstVelocity:
     it to the joints. A target that is expected to rest is taken to come as it moves now.
     """
 
-    in_keys: ClassVar[tuple[str, ...]] = (keys.TARGET_HISTORY,)
-
     slowest: float = 1e-4
     """A target that moves less in a control step says nothing: the tool stays turned as it is [m]."""
 
     def __post_init__(self) -> None:
         check_number("slowest", self.slowest, minimum=0.0)
+
+    @property
+    def in_keys(self) -> Sequence[Any]:
+        """As of `Turn`."""
+        return (keys.TARGET_HISTORY,)
 
     def __call__(self, path: Tensor, target_pos: Tensor, *seen: Tensor) -> Tensor:
         """As of `Turn`."""
