@@ -16,6 +16,7 @@ SMALL = {
     "braking": "--episodes 2 --num-envs 2 --threads 1",
     "arrival_time": "--batches 2 --cases 3 --seconds 0.01",
     "chase": "--rows 8",
+    "catch": "--episodes 2 --sensors exact --planners pursuit --split dev",
     "conveyor": "--episodes 2 --speeds 0.6 --planners pursuit:gain",
     "calibration": "--episodes 8 --pursuit-episodes 8 --split dev",
     "ceiling": "--velocities 5 --episodes 3 --spacing 60 --meetings 1 --leads 7 --rows 64 --split dev",

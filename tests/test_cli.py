@@ -165,7 +165,7 @@ BAD = [
     (["evaluate", "--planners"], "planners must name at least one of"),
     (["evaluate", "--static", "kuka"], "unknown static planner of trapper 'kuka'"),
     (["evaluate", "--task", "fetch_raech"], "unknown task 'fetch_raech' (did you mean 'fetch_reach'?)"),
-    (["evaluate", "--task"], "--task names none; choose from chase, conveyor, fetch_reach, trapper"),
+    (["evaluate", "--task"], "--task names none; choose from catch, chase, conveyor, fetch_reach, trapper"),
     (["evaluate", "--task", "no.such.module:TASK"], "no task at 'no.such.module:TASK': No module named 'no'"),
     (["evaluate", "--task", "fetch_reach", "--planners", "wait_and_drop"], "unknown planner of fetch_reach"),
     (["evaluate", "--task", "fetch_reach", "--velocity", "3"], "velocity must be in [0, 0.2], got 3.0"),

@@ -25,6 +25,7 @@ EXAMPLES = Path(__file__).parent.parent / "examples"
         ("07_fine_tune_forecaster.py", "after: miss 0.0"),
         ("08_meet_a_walker.py meeting.webp", "written: meeting.webp"),
         ("09_take_parts_off_a_belt.py", "part 3 of 3 is off the belt"),
+        ("10_meet_a_thrown_ball.py", "ball 3: in the cup"),
         ("fine_tune_in_rollout.py --balls 4 --rounds 2 --steps 150", "round 2: "),
         ("collect_in_parallel.py --balls 2 --steps 120", "of 4 balls, "),
         ("stock_torchrl.py --frames 400 --warmup 200 --batch 32", "400 frames: return"),

@@ -104,7 +104,7 @@ def names_of_tasks() -> set[str]:
 
 
 def test_there_are_tasks_and_names_to_look_for():
-    assert TASKS == ["chase", "conveyor", "fetch_reach", "trapper"]
+    assert TASKS == ["catch", "chase", "conveyor", "fetch_reach", "trapper"]
     assert names_of_tasks() > {"TrapperScene", "WaitAndDrop", "DynamicReachEnv", "BoxApproach", "trapper"}
     assert len(general_files()) > 60
 

@@ -42,4 +42,5 @@ __getattr__, __dir__ = lazy_names(
         "training.collect": ("collect",),
         "training.train": ("train",),
     },
+    packages=("envs", "evaluation", "kinematics", "nets", "planners", "tasks", "training"),
 )

@@ -118,7 +118,13 @@ def test_a_sweep_runs_over_any_setting_that_has_values(tmp_path):
 def test_importing_the_package_imports_nothing_else():
     script = "import sys; before = set(sys.modules); import torchdyn_plan; print(*sorted(set(sys.modules) - before))"
     done = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, check=True)
-    assert done.stdout == "torchdyn_plan\n"
+    assert done.stdout == "__future__ torchdyn_plan torchdyn_plan.lazy\n"
+
+
+def test_a_package_inside_is_there_without_an_import_of_its_own():
+    script = "import torchdyn_plan; print(torchdyn_plan.kinematics.__name__, 'torch' in vars(torchdyn_plan))"
+    done = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, check=True)
+    assert done.stdout == "torchdyn_plan.kinematics False\n"
 
 
 def test_the_package_has_one_face():

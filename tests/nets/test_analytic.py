@@ -5,6 +5,7 @@ import torch
 
 from torchdyn_plan import keys
 from torchdyn_plan.errors import InputError
+from torchdyn_plan.kinematics.flight import fly
 from torchdyn_plan.nets import Ballistic, Billiard, ConstantVelocity
 from torchdyn_plan.nets.analytic import normal_spread
 
@@ -12,10 +13,13 @@ STEP, HALF = 0.004, 0.7
 KINDS = [
     ConstantVelocity(horizon=50),
     Ballistic(horizon=50),
+    Ballistic(horizon=50, drag=0.05),
     Billiard(HALF, horizon=50),
     Billiard(HALF, horizon=50, restitution=1.0, deceleration=0.02, sliding=0.5, gaps=[(0.3, 0.5)]),
 ]
-ALL = pytest.mark.parametrize("model", KINDS, ids=["straight", "flight", "billiard", "billiard with all"])
+ALL = pytest.mark.parametrize(
+    "model", KINDS, ids=["straight", "flight", "flight with drag", "billiard", "billiard with all"]
+)
 
 
 def history(place, velocity, count=24):
@@ -56,6 +60,16 @@ def test_a_target_falls():
     )
     path = Ballistic(horizon=60).predict(flight[:24]).path
     torch.testing.assert_close(path, flight[24:])
+
+
+def test_a_target_is_slowed_down_by_the_air():
+    start, velocity = torch.tensor([[3.0, 0.1, 1.5], [-6.0, 0.4, 2.0]], dtype=torch.float64)
+    law = {"gravity": (0.0, 0.0, -9.81), "drag": 0.04}
+    flight, _ = fly(start, velocity, step=STEP, count=180, **law)
+    path = Ballistic(horizon=150, drag=0.04).predict(flight[:30]).path
+    torch.testing.assert_close(path, flight[30:], rtol=0.0, atol=1e-5)
+    without = Ballistic(horizon=150).predict(flight[:30]).path
+    assert (without - flight[30:])[-1].norm() > 0.1
 
 
 @pytest.mark.parametrize("e", [1.0, 0.9, 0.5])
@@ -175,6 +189,7 @@ def test_it_is_told_by_its_settings(model):
     [
         (lambda: ConstantVelocity(horizon=0), "horizon must be >= 1, got 0"),
         (lambda: Ballistic(gravity=(1.0,)), r"gravity must be two or three numbers, got \(1.0,\)"),
+        (lambda: Ballistic(drag=-0.1), "drag must be >= 0, got -0.1"),
         (lambda: Billiard(0.0), "half_extent must be >= 1e-09, got 0.0"),
         (lambda: Billiard(1.0, restitution=1.2), r"restitution must be in \[0.01, 1\], got 1.2"),
         (lambda: Billiard(1.0, gaps=[(0.5, 0.2)]), r"gaps must be pairs that rise within ±1, got \(0.5, 0.2\)"),

@@ -6,7 +6,8 @@ import torch
 from torch.utils._python_dispatch import TorchDispatchMode
 
 from torchdyn_plan.errors import InputError
-from torchdyn_plan.planners import KalmanTrack, LeastSquaresTrack
+from torchdyn_plan.kinematics.flight import fly
+from torchdyn_plan.planners import BallisticTrack, KalmanTrack, LeastSquaresTrack
 
 KINDS = [
     KalmanTrack(noise=0.005, agility=0.5),
@@ -330,3 +331,78 @@ def test_shapes_are_checked():
         track.add(state, zero, torch.zeros(2, 2), zero)
     with pytest.raises(InputError, match=r"time of a measurement must have shape \(\*B, 2\), got \(3,\)"):
         track.add(state, torch.zeros(3), torch.zeros(3, 3), zero)
+
+
+DOWN = (0.0, 0.0, -9.81)
+
+
+def flights(*batch, count, drag=0.0, noise=0.003, step=1 / 60, seed=0):
+    """Moments (T,), measured and true places (*B, T, 3), and true velocities of balls that are thrown."""
+    draw = torch.Generator().manual_seed(seed)
+    start, velocity = torch.randn(2, *batch, 3, generator=draw, dtype=torch.float64)
+    velocity = 2.0 * velocity + torch.tensor([-4.0, 0.0, 2.0])
+    place, moved = fly(start, velocity, step=step, count=count - 1, gravity=DOWN, drag=drag)
+    places = torch.cat([start.unsqueeze(-2), place], dim=-2)
+    moved = torch.cat([velocity.unsqueeze(-2), moved], dim=-2)
+    times = step * torch.arange(count, dtype=torch.float64)
+    return times, places + noise * torch.randn(places.shape, generator=draw, dtype=torch.float64), places, moved
+
+
+def test_a_ball_that_falls_is_the_textbook_s_filter_of_what_gravity_leaves():
+    track = BallisticTrack(noise=0.003, acceleration=0.5, agility=1.0)
+    times, measured_at, _, _ = flights(4, count=20)
+    state = measured(track, times, measured_at)
+    fallen = 0.5 * times[-1] ** 2 * torch.tensor(DOWN, dtype=torch.float64)
+    left = measured_at - 0.5 * times.unsqueeze(-1) ** 2 * torch.tensor(DOWN, dtype=torch.float64)
+    for row in range(4):
+        for axis in range(3):
+            mean, covariance = textbook(3, 1.0, 0.003, (3.0, 0.5), times.numpy(), left[row, :, axis].numpy())
+            assert abs(state.pos[row, axis] - fallen[axis] - mean[0]) < 1e-9
+            assert abs(state.velocity[row, axis] - times[-1] * DOWN[axis] - mean[1]) < 1e-8
+            np.testing.assert_allclose(state.covariance[row].numpy(), covariance[:2, :2], rtol=1e-6)
+
+
+def test_who_knows_gravity_and_expects_drag_knows_a_flight_sooner():
+    times, seen, _, moved = flights(400, count=7, drag=0.02)
+    kinds = (BallisticTrack(noise=0.003), KalmanTrack(noise=0.003, accelerates=True, acceleration=10.0))
+    error = [(measured(track, times, seen).velocity - moved[:, -1]).norm(dim=-1).mean() for track in kinds]
+    assert error[0] < 0.1
+    assert error[1] > 2.5 * error[0]
+
+
+def test_a_ball_falls_on_between_and_after_measurements():
+    track = BallisticTrack(noise=1e-4, acceleration=1e-3, agility=0.0)
+    times, seen, places, _ = flights(3, count=12, noise=0.0)
+    state = measured(track, times[:6], seen[:, :6])
+    ahead = track.at(state, times.new_full((3,), times[-1].item()))
+    torch.testing.assert_close(ahead.pos, places[:, -1], rtol=0.0, atol=2e-3)
+    torch.testing.assert_close(state.path(times[:6].expand(3, 6)), places[:, :6], rtol=0.0, atol=1e-3)
+    assert (state.restarts == 0).all()
+
+
+def test_a_ball_that_has_bounced_falls_again():
+    """Upwards from the floor, and then as fast down as gravity makes it."""
+    track = BallisticTrack(noise=1e-3, rebound=0.8)
+    times = 0.01 * torch.arange(40, dtype=torch.float64)
+    down = 0.2 - 2.0 * times - 4.905 * times**2
+    hits = 0.2 / (1.0 + (1.0 + 0.2 * 9.81 / 2.0) ** 0.5)
+    after = times - hits
+    up = 0.8 * (2.0 + 9.81 * hits) * after - 4.905 * after**2
+    height = torch.where(times < hits, down, up)
+    places = torch.stack([times, 0.0 * times, height], dim=-1).unsqueeze(0)
+    state = measured(track, times, places)
+    assert state.restarts.tolist() == [1]
+    torch.testing.assert_close(state.pos[0, 2], height[-1], rtol=0.0, atol=2e-3)
+    speed = 0.8 * (2.0 + 9.81 * hits) - 9.81 * after[-1]
+    assert (state.velocity[0, 2] - speed).abs() < 0.1
+
+
+def test_a_ballistic_track_in_a_plane_needs_a_gravity_of_two_numbers():
+    time = torch.zeros(2)
+    with pytest.raises(InputError, match="gravity has 3 numbers, but targets 2 coordinates"):
+        BallisticTrack().add(BallisticTrack().start(torch.zeros(2, 2)), time, torch.zeros(2, 2), time)
+    flat = BallisticTrack(gravity=(0.0, -9.81))
+    state = flat.add(flat.start(torch.zeros(2, 2)), time, torch.ones(2, 2), time)
+    assert flat.at(state, time + 1.0).pos[:, 1].tolist() == pytest.approx([1.0 - 4.905] * 2)
+    with pytest.raises(InputError, match="gravity must be two or three numbers"):
+        BallisticTrack(gravity=(1.0,))

@@ -6,7 +6,7 @@ from torchdyn_plan.tasks import load_task
 
 
 @pytest.mark.parametrize(
-    ("name", "scene"), [("trapper", "ur5"), ("trapper", "paper"), ("chase", None), ("conveyor", None)]
+    ("name", "scene"), [("trapper", "ur5"), ("trapper", "paper"), ("catch", None), ("chase", None), ("conveyor", None)]
 )
 def test_steps_are_those_of_the_environment(name, scene):
     task = load_task(name, scene) if scene else load_task(name)

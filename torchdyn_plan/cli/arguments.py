@@ -61,11 +61,15 @@ class TrackArguments:
     window: float | None = None
     """Of least_squares: time over which a measurement's weight falls to 1/e [s]."""
     agility: float | None = None
-    """Of kalman: after t seconds the velocity may have changed by this times the root of t [m/s² per √Hz]."""
+    """Of kalman: after t seconds the velocity may have changed by this times the root of t [m/s² per √Hz]; of ballistic
+    the acceleration [m/s³ per √Hz]."""
     accelerates: bool | None = None
     """Of kalman: whether the acceleration is constant, and not the velocity."""
     acceleration: float | None = None
-    """Of kalman with accelerates: standard deviation of the initial acceleration [m/s²]."""
+    """Of kalman with accelerates: standard deviation of the initial acceleration [m/s²]; of ballistic that of what
+    accelerates the target beside gravity."""
+    gravity: tuple[float, ...] | None = None
+    """Of ballistic: acceleration of a target that falls, a number for each axis [m/s²]."""
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -41,7 +41,7 @@ FITTED = {
 }
 """Networks that are fitted to data, and what ``--help`` says of them."""
 
-TRACKS = ("none", "least_squares", "kalman")
+TRACKS = ("none", "least_squares", "kalman", "ballistic")
 """Tracks by name; tests hold them against `torchdyn_plan.evaluation.tracks`, which takes long to import."""
 ENGINES = ("here", "ray")
 """What runs a sweep; tests hold them against `torchdyn_plan.evaluation.engines`, which takes long to import."""

@@ -90,8 +90,8 @@ def sweep(
         other_scene: allow planners that belong to another scene.
         overwrite: remove all results in the folder, including points of this sweep.
         progress: show progress bars.
-        engine: ``here`` or ``ray``, which runs the points in workers of a Ray cluster. Results are the same except for the
-            times that they took.
+        engine: ``here`` or ``ray``, which runs the points in workers of a Ray cluster, with the same results except for
+            the times that they took.
         workers: number of Ray workers, with one thread each; one per processor for None.
         settings: the task's other settings, by name.
 

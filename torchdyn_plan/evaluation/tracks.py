@@ -9,11 +9,15 @@ from typing import Any
 from torchdyn_plan.checks import check_choice
 from torchdyn_plan.envs.sensor import Sensor
 from torchdyn_plan.errors import InputError
-from torchdyn_plan.planners import KalmanTrack, LeastSquaresTrack, Track
+from torchdyn_plan.planners import BallisticTrack, KalmanTrack, LeastSquaresTrack, Track
 
 NO_TRACK = "none"
 """The planner sees the newest measurement, held from step to step."""
-TRACKS: Mapping[str, type[Track]] = {"least_squares": LeastSquaresTrack, "kalman": KalmanTrack}
+TRACKS: Mapping[str, type[Track]] = {
+    "least_squares": LeastSquaresTrack,
+    "kalman": KalmanTrack,
+    "ballistic": BallisticTrack,
+}
 """Filters that may stand between sensor and planner."""
 LEAST_NOISE = 1e-4
 """Lower bound on a track's ``noise`` [m], because targets do not move as smoothly as the filter's model."""

@@ -13,6 +13,7 @@ from torch import Tensor
 from torchdyn_plan import keys
 from torchdyn_plan.checks import check_number, check_points, check_trailing_shape, check_vector
 from torchdyn_plan.errors import InputError
+from torchdyn_plan.kinematics.flight import braked, fly
 from torchdyn_plan.nets.distributions import Spread
 from torchdyn_plan.nets.forecast import Forecast, ForecastModel
 from torchdyn_plan.precision import at_least_float32
@@ -113,26 +114,41 @@ class ConstantVelocity(AnalyticForecast):
 
 
 class Ballistic(AnalyticForecast):
-    """The target flies: it falls with a constant acceleration, and nothing else acts on it."""
+    """The target flies: it falls with a constant acceleration, and the air slows it down where it has a ``drag``."""
 
-    def __init__(self, *, gravity: Sequence[float] = (0.0, 0.0, -9.81), **settings: Any) -> None:
-        """Fall with ``gravity``, D numbers [m/s², world]; ``settings`` are those of `AnalyticForecast`."""
+    def __init__(self, *, gravity: Sequence[float] = (0.0, 0.0, -9.81), drag: float = 0.0, **settings: Any) -> None:
+        """Fall, and be slowed down.
+
+        Args:
+            gravity: D numbers [m/s², world].
+            drag: deceleration over speed squared, against the velocity [1/m]; 0 for none.
+            settings: those of `AnalyticForecast`.
+        """
         super().__init__(**settings)
         self.gravity = check_vector("gravity", gravity)
+        check_number("drag", drag, minimum=0.0)
+        self.drag = drag
 
     def follow(self, history: Tensor, velocity: Tensor, time: Tensor, deviation: Tensor) -> Forecast:
         """As of `AnalyticForecast`."""
         if len(self.gravity) != history.shape[-1]:
             raise InputError(f"gravity has {len(self.gravity)} numbers, but targets {history.shape[-1]} coordinates")
-        falls, moment = time.new_tensor(self.gravity), time.unsqueeze(-1)
+        falls = time.new_tensor(self.gravity)
         # The mean velocity over the last step is that of half a step ago.
-        speed = velocity + 0.5 * self.control_step * falls
-        path = history[..., -1:, :] + moment * speed.unsqueeze(-2) + 0.5 * moment.square() * falls
+        if self.drag:
+            now = velocity + 0.5 * self.control_step * braked(velocity, falls, self.drag)
+            law: dict[str, Any] = {"gravity": self.gravity, "drag": self.drag}
+            path, _ = fly(history[..., -1, :], now, step=self.control_step, count=len(time), **law)
+        else:
+            moment, speed = time.unsqueeze(-1), velocity + 0.5 * self.control_step * falls
+            path = history[..., -1:, :] + moment * speed.unsqueeze(-2) + 0.5 * moment.square() * falls
         return Forecast(path, normal_spread(deviation.unsqueeze(-1).expand(*deviation.shape, 2)))
 
     def part_settings(self) -> dict[str, Any]:
         """Constructor arguments of this model."""
-        return super().part_settings() | {"gravity": self.gravity}
+        # Models that are older than the drag keep their description.
+        own: dict[str, Any] = {"gravity": self.gravity} | ({"drag": self.drag} if self.drag else {})
+        return super().part_settings() | own
 
 
 class Rolled(NamedTuple):

@@ -40,13 +40,16 @@ if TYPE_CHECKING:
     from torchdyn_plan.planners.static.point import PointPlanner
     from torchdyn_plan.planners.static.policy import PolicyPlanner
     from torchdyn_plan.planners.static.proportional import ProportionalController
-    from torchdyn_plan.planners.track import KalmanTrack, LeastSquaresTrack, Track, TrackState
+    from torchdyn_plan.planners.stay import GoAndStay
+    from torchdyn_plan.planners.track import BallisticTrack, KalmanTrack, LeastSquaresTrack, Track, TrackState
     from torchdyn_plan.planners.tracked import TrackedPlanner
-    from torchdyn_plan.planners.turn import Turn, WithTarget
+    from torchdyn_plan.planners.turn import AgainstVelocity, Turn, WithTarget
 
 __all__ = [
+    "AgainstVelocity",
     "Approach",
     "Background",
+    "BallisticTrack",
     "CallablePlanner",
     "ChoosingPlanner",
     "Commits",
@@ -57,6 +60,7 @@ __all__ = [
     "EndOfForecast",
     "EventSchedule",
     "ExactSearch",
+    "GoAndStay",
     "GoTo",
     "GoalSearch",
     "IKPlanner",
@@ -131,8 +135,9 @@ __getattr__, __dir__ = lazy_names(
         "static.point": ("PointPlanner",),
         "static.policy": ("PolicyPlanner",),
         "static.proportional": ("ProportionalController",),
-        "track": ("KalmanTrack", "LeastSquaresTrack", "Track", "TrackState"),
+        "stay": ("GoAndStay",),
+        "track": ("BallisticTrack", "KalmanTrack", "LeastSquaresTrack", "Track", "TrackState"),
         "tracked": ("TrackedPlanner",),
-        "turn": ("Turn", "WithTarget"),
+        "turn": ("AgainstVelocity", "Turn", "WithTarget"),
     },
 )

@@ -18,7 +18,8 @@ import torch
 from torch import Tensor
 from torch.func import debug_unwrap
 
-from torchdyn_plan.checks import POINT_SIZES, check_number, check_trailing_shape, hides_values
+from torchdyn_plan.checks import POINT_SIZES, check_number, check_trailing_shape, check_vector, hides_values
+from torchdyn_plan.errors import InputError
 from torchdyn_plan.planners.rows import where_rows
 
 LARGEST = 1e6
@@ -147,7 +148,12 @@ class Track(ABC):
 
     def told(self) -> dict[str, Any]:
         """Its kind and settings by name, to be stored in files."""
-        return {"kind": type(self).__name__} | dataclasses.asdict(self)
+        # As JSON has it: what is read from a file is compared with it.
+        own = (
+            (name, list(value) if isinstance(value, tuple) else value)
+            for name, value in dataclasses.asdict(self).items()
+        )
+        return {"kind": type(self).__name__} | dict(own)
 
     @property
     def order(self) -> int:
@@ -333,7 +339,7 @@ class Track(ABC):
         turned = torch.where(lost, 0.0, turned)
         before = [torch.where(lost, new, old) for new, old in zip([where, turned], expected.mean, strict=False)]
         return TrackState(
-            motion=_packed([where, turned, *map(torch.zeros_like, expected.mean[2:])], self._unsure(time, variance)),
+            motion=_packed([where, turned, *self._expected(where)], self._unsure(time, variance)),
             time=time,
             begin=torch.where(lost, time, state.begin),
             since=time,
@@ -353,6 +359,10 @@ class Track(ABC):
     def _unknown(self) -> list[float]:
         """Prior standard deviations of the velocity and further derivatives."""
         return [self.speed]
+
+    def _expected(self, like: Tensor) -> list[Tensor]:
+        """Further derivatives, ``(D, *B)`` each as ``like``, that are expected of a target whose motion begins."""
+        return [torch.zeros_like(like)] * (self.order - 2)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -385,6 +395,44 @@ class KalmanTrack(Track):
     @property
     def _unknown(self) -> list[float]:
         return [self.speed, self.acceleration] if self.accelerates else [self.speed]
+
+
+@dataclass(frozen=True, kw_only=True)
+class BallisticTrack(Track):
+    """The Kalman filter of a target that falls with gravity, but for what else accelerates it, as drag does."""
+
+    gravity: tuple[float, ...] = (0.0, 0.0, -9.81)
+    """Acceleration that is expected, a number for each axis [m/s², world]."""
+    acceleration: float = 0.5
+    """Standard deviation of what else accelerates the target, along each axis [m/s²]."""
+    agility: float = 1.0
+    """After t seconds without a measurement the acceleration may have changed by ``agility``·√t [m/s³ per √Hz]."""
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        object.__setattr__(self, "gravity", check_vector("gravity", self.gravity))
+        check_number("acceleration", self.acceleration, minimum=1e-6)
+        check_number("agility", self.agility, minimum=0.0)
+
+    @property
+    def order(self) -> int:
+        """As of `Track`."""
+        return 3
+
+    @property
+    def wander(self) -> float:
+        """As of `Track`."""
+        return self.agility**2
+
+    @property
+    def _unknown(self) -> list[float]:
+        return [self.speed, self.acceleration]
+
+    def _expected(self, like: Tensor) -> list[Tensor]:
+        if len(self.gravity) != len(like):
+            raise InputError(f"gravity has {len(self.gravity)} numbers, but targets {len(like)} coordinates")
+        falls = like.new_tensor(self.gravity).view(-1, *[1] * (like.ndim - 1))
+        return [falls.expand_as(like)]
 
 
 @dataclass(frozen=True, kw_only=True)

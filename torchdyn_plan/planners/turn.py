@@ -13,7 +13,7 @@ from torch import Tensor
 from torchdyn_plan import keys
 from torchdyn_plan.checks import check_number, check_trailing_shape, check_vector
 from torchdyn_plan.errors import InputError
-from torchdyn_plan.kinematics.quaternions import quat_matrix, quat_multiply
+from torchdyn_plan.kinematics.quaternions import quat_between, quat_matrix, quat_multiply
 
 
 class Turn(Protocol):
@@ -79,3 +79,39 @@ class WithTarget:
         faces = (quat_matrix(quats)[..., 0] * quats.new_tensor(self.facing)).sum(-1)
         best = faces.argmax(-1)[..., None, None]
         return quats.gather(-2, best.expand(*best.shape[:-1], 4)).squeeze(-2)
+
+
+@dataclass(frozen=True, kw_only=True)
+class AgainstVelocity:
+    """The tool's z axis points against the target's velocity, as a cup into which a ball flies: ``target_history``.
+
+    How the tool is turned about that axis does not matter: use it with `TurnedToGoal` of ``symmetry`` 0, which leaves
+    it to the joints. A target that is expected to rest is taken to come as it moves now.
+    """
+
+    slowest: float = 1e-4
+    """A target that moves less in a control step says nothing: the tool stays turned as it is [m]."""
+
+    def __post_init__(self) -> None:
+        check_number("slowest", self.slowest, minimum=0.0)
+
+    @property
+    def in_keys(self) -> Sequence[Any]:
+        """As of `Turn`."""
+        return (keys.TARGET_HISTORY,)
+
+    def __call__(self, path: Tensor, target_pos: Tensor, *seen: Tensor) -> Tensor:
+        """As of `Turn`."""
+        (history,) = seen
+        check_trailing_shape(keys.TARGET_HISTORY, history, history.shape[-2] if history.ndim > 1 else 2, 3)
+        moves = torch.diff(path, dim=-2, prepend=target_pos.unsqueeze(-2))
+        now = (target_pos - history[..., -2, :]).unsqueeze(-2)
+        moves = torch.where(self._are_moves(moves), moves, now)
+        known = self._are_moves(moves)
+        # Of nothing, normalised, there would be no derivative.
+        ahead = torch.where(known, -moves, moves.new_tensor([0.0, 0.0, 1.0]))
+        return torch.where(known, quat_between(moves.new_tensor([0.0, 0.0, 1.0]), ahead), 0.0)
+
+    def _are_moves(self, moves: Tensor) -> Tensor:
+        """Whether steps ``(*B, F, 3)`` [m] lead anywhere, ``(*B, F, 1)`` bool."""
+        return moves.square().sum(-1, keepdim=True) > self.slowest**2

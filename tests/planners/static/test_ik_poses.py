@@ -60,12 +60,37 @@ def test_a_braked_step_ends_at_rest_at_its_goal_and_never_brakes_harder_than_it_
         way = way - steps[-1]
     steps = torch.stack(steps)
     assert way.abs().max() < 1e-5
-    assert (steps.sign().unique(dim=0) == steps[0].sign()).all()
+    assert (steps * steps[0].sign() >= 0.0).all()
     assert (steps.abs() <= limit + 1e-12).all()
     assert (-steps.abs().diff(dim=0) <= brake + 1e-9).all()
     assert steps[:, 0, 0].max() > 0.99 * limit[0]
     # Joints arrive together: the way is straight.
-    torch.testing.assert_close(steps[:, 0, 1] / steps[:, 0, 0], torch.full((80,), -0.2, dtype=torch.float64))
+    torch.testing.assert_close(steps[:, 0, 1], -0.2 * steps[:, 0, 0], rtol=1e-7, atol=1e-12)
+
+
+@pytest.mark.parametrize("rest", [0.0, 1e-9, -1e-7])
+def test_a_joint_that_takes_no_part_holds_up_no_other(rest):
+    limit, brake = torch.full((3,), 0.02), torch.full((3,), 8e-4)
+    alone = braked_step(torch.tensor([0.5, -0.2]), limit[:2], brake[:2])
+    step = braked_step(torch.tensor([0.5, -0.2, rest]), limit, brake)
+    torch.testing.assert_close(step[:2], alone)
+    assert step[2].abs() <= abs(rest)
+
+
+@pytest.mark.parametrize("how", [{"acceleration": 8.0}, {"acceleration": None, "gain": 0.2}], ids=["brakes", "gain"])
+def test_a_round_tool_turns_about_its_own_axis_as_its_joints_like(how):
+    goal = pose_goal(HOME + torch.tensor([0.4, 0.2, -0.3, 0.2, 0.4, 1.5]))
+    planner = planner_of(approach=TurnedToGoal(symmetry=0), **how)
+    path = drive(planner, goal.expand(80, 2, 7))
+    end = ARM(path[-1])
+    assert (end[:, :3, 3] - goal[:, :3]).norm(dim=-1).max() < 2e-3
+    axis = quat_matrix(goal[:, 3:])[..., 2]
+    assert ((end[:, :3, 2] * axis).sum(-1) > 0.9999).all()
+    # The last joint turns the tool about its axis alone.
+    torch.testing.assert_close(path[-1, :, 5], HOME[:, 5], rtol=0.0, atol=1e-4)
+    found, reached = planner.goal_joints(HOME, goal)
+    assert reached.all()
+    torch.testing.assert_close(found[:, 5], HOME[:, 5], rtol=0.0, atol=1e-4)
 
 
 def test_zeros_leave_the_tool_turned_as_it_is():

@@ -104,3 +104,8 @@ class TurnedToGoal:
 def reads_pose(approach: Approach) -> bool:
     """Whether an approach reads the tool's orientation: its goals are ``goal_pose``."""
     return bool(getattr(approach, "reads_pose", False))
+
+
+def is_round(approach: Approach) -> bool:
+    """Whether the tool of an approach is the same after any turn about its z axis."""
+    return getattr(approach, "symmetry", 1) == 0

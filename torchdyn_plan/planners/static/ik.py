@@ -23,7 +23,7 @@ from torchdyn_plan.kinematics.fused import Columns, Fused, filled
 from torchdyn_plan.nets.analytic_arrival import AnalyticArrival
 from torchdyn_plan.planners.memory import remember, warn_of_loss
 from torchdyn_plan.planners.protocol import read
-from torchdyn_plan.planners.static.approach import Approach, StraightToGoal, reads_pose
+from torchdyn_plan.planners.static.approach import Approach, StraightToGoal, is_round, reads_pose
 from torchdyn_plan.planners.static.base import StaticPlannerModule
 from torchdyn_plan.precision import Precise
 
@@ -105,6 +105,7 @@ class IKPlanner(Precise, StaticPlannerModule):
             check_number("chunk", chunk, minimum=1, integer=True)
         self.arm, self.approach = arm, approach or StraightToGoal()
         turns = reads_pose(self.approach)
+        self._round = is_round(self.approach)
         self.goal_key, self.goal_size = (keys.GOAL_POSE, 7) if turns else (keys.GOAL, 3)
         if compiled and (turns or acceleration is not None):
             raise InputError("a compiled IKPlanner takes neither poses nor an acceleration: leave compiled=False")
@@ -236,7 +237,8 @@ class IKPlanner(Precise, StaticPlannerModule):
         for _ in range(GOAL_STEPS):
             pose, jacobian = self.arm.pose_and_jacobian(q)
             error = self._way(pose, goal)
-            step = limited_step(dls_step(jacobian[..., : error.shape[-1], :], error, GOAL_DAMPING), longest, 1.0)
+            rows = self._rows(pose, jacobian, error.shape[-1])
+            step = limited_step(dls_step(rows, error, GOAL_DAMPING), longest, 1.0)
             q = torch.clamp(q + step, self.arm.lower, self.arm.upper)
         way = self._way(self.arm(q), goal)
         left = way[..., :3].norm(dim=-1)
@@ -249,6 +251,16 @@ class IKPlanner(Precise, StaticPlannerModule):
     def _way(self, pose: Tensor, goal: Tensor) -> Tensor:
         """The remaining twist from poses (R, 4, 4) to goals (R, 3 or 7)."""
         return torch.stack(self.approach.twist(pose[..., :3, :].flatten(-2).unbind(-1), goal.unbind(-1)), dim=-1)
+
+    def _rows(self, pose: Tensor, jacobian: Tensor, count: int) -> Tensor:
+        """The first ``count`` rows of ``jacobian`` (*B, 6, N), of which a tool that is round may turn as it likes."""
+        rows = jacobian if count == 6 else jacobian[..., :count, :]
+        if not self._round:
+            return rows
+        # No joint works against a turn about the tool's own axis.
+        axis = pose[..., :3, 2].unsqueeze(-1)
+        move, turn = rows[..., :3, :], rows[..., 3:, :]
+        return torch.cat([move, turn - axis * (axis * turn).sum(-2, keepdim=True)], dim=-2)
 
     def step(self, joint_pos: Tensor, goal: Tensor, before: Tensor | None = None) -> tuple[Tensor, Tensor]:
         """One step of the path from ``joint_pos`` (*B, N) [rad] towards ``goal`` (*B, 3) [m, world].
@@ -285,7 +297,7 @@ class IKPlanner(Precise, StaticPlannerModule):
         moves = moved[..., :3].norm(dim=-1, keepdim=True) <= GOAL_SPEED * self.control_step
         along = torch.where(moves, moved, 0.0)
         low, high = self.arm.lower - joint_pos, self.arm.upper - joint_pos
-        rows = jacobian[..., : error.shape[-1], :]
+        rows = self._rows(pose, jacobian, error.shape[-1])
         ways = [self._within(dls_step(rows, way, self.damping), rows, way, low, high) for way in (error - along, along)]
         step = limited_step(braked_step(ways[0], self._limit, self._brake) + ways[1], self._limit, 1.0)
         step = torch.clamp(step, low, high)
@@ -299,7 +311,7 @@ class IKPlanner(Precise, StaticPlannerModule):
     def _step_from(self, joint_pos: Tensor, goal: Tensor, pose: Tensor, jacobian: Tensor) -> tuple[Tensor, Tensor]:
         """`step` for known pose and Jacobian of the tool."""
         error = torch.stack(self.approach.twist(pose.flatten(-2).unbind(-1), goal.unbind(-1)), dim=-1)
-        rows = jacobian if error.shape[-1] == 6 else jacobian[..., : error.shape[-1], :]
+        rows = self._rows(pose, jacobian, error.shape[-1])
         limit, bounds = cast(Tensor, self._buffers["_limit"]), cast(dict[str, Tensor], self.arm._buffers)
         low, high = bounds["lower"] - joint_pos, bounds["upper"] - joint_pos
         whole = dls_step(rows, error, self.damping)
@@ -327,7 +339,8 @@ class IKPlanner(Precise, StaticPlannerModule):
         assert self._fused is not None
         action, reached, room = self._fused(joint_pos, goal)
         # A single row is read directly: a minimum would take a tenth of the step's time.
-        if not (room if room.numel() == 1 else room.amin()).item() > 0.0:
+        count = room.numel()
+        if count and not (room if count == 1 else room.amin()).item() > 0.0:
             rows = (room.squeeze(-1) <= 0.0).nonzero().squeeze(-1)
             joint_pos, goal = joint_pos[rows], goal[rows]
             action[rows], reached[rows] = self._step_from(joint_pos, goal, *evaluate(self.arm, joint_pos))
