@@ -157,40 +157,52 @@ class Billiard(AnalyticForecast):
 
     def __init__(
         self,
-        half_extent: float,
+        half_extent: float | Sequence[float],
         *,
         restitution: float = 0.9,
         restitution_deviation: float = 0.03,
         deceleration: float = 0.0,
         sliding: float = 0.0,
+        drag: float = 0.0,
         gaps: Sequence[tuple[float, float]] = (),
         gone_height: float = -0.1,
         **settings: Any,
     ) -> None:
-        """Roll between cushions at ±``half_extent``, where the target's centre turns back along x and along y [m].
+        """Roll between cushions at ±``half_extent``, where the target's centre turns back [m].
 
         Args:
-            half_extent: as above.
+            half_extent: as above, one number for a square table, or one along x and one along y.
             restitution: share of the speed across a cushion that comes back; along it nothing is lost.
             restitution_deviation: standard deviation of that share.
             deceleration: at which a rolling target loses speed [m/s²].
             sliding: at which one does that has bounced, and slides until it rolls again [m/s²]. Whether it slides now
                 shows in its history.
+            drag: share of its speed that a target on a cushion of air loses in a second [1/s]; in place of both
+                decelerations.
             gaps: first and last coordinate, along each of the four cushions, between which there is none [m].
             gone_height: of a target that fell through [m, world].
             settings: those of `AnalyticForecast`.
         """
         super().__init__(**settings)
-        check_number("half_extent", half_extent, minimum=1e-9)
+        oblong = isinstance(half_extent, Sequence)
+        sides: tuple[float, ...] = check_vector("half_extent", half_extent) if oblong else (half_extent,)
+        if len(sides) > 2:
+            raise InputError(f"half_extent must be one number or two, along x and y, got {half_extent!r}")
+        for side in sides:
+            check_number("half_extent", side, minimum=1e-9)
         check_number("restitution", restitution, minimum=0.01, maximum=1.0)
         check_number("restitution_deviation", restitution_deviation, minimum=0.0)
         check_number("deceleration", deceleration, minimum=0.0)
         check_number("sliding", sliding, minimum=0.0)
+        check_number("drag", drag, minimum=0.0)
+        if drag and (deceleration or sliding):
+            raise InputError(f"a table has drag or decelerations, got {drag:g}, {deceleration:g} and {sliding:g}")
         check_number("gone_height", gone_height)
         for gap in gaps:
-            if len(gap) != 2 or not -half_extent <= gap[0] < gap[1] <= half_extent:
-                raise InputError(f"gaps must be pairs that rise within ±{half_extent:g}, got {gap!r}")
-        self.half_extent, self.restitution, self.restitution_deviation = half_extent, restitution, restitution_deviation
+            if len(gap) != 2 or not -min(sides) <= gap[0] < gap[1] <= min(sides):
+                raise InputError(f"gaps must be pairs that rise within ±{min(sides):g}, got {gap!r}")
+        self.half_extent = sides if oblong else sides[0]
+        self.drag, self.restitution, self.restitution_deviation = drag, restitution, restitution_deviation
         self.deceleration, self.sliding, self.gone_height = deceleration, sliding, gone_height
         self.gaps = tuple((float(first), float(last)) for first, last in gaps)
 
@@ -214,7 +226,7 @@ class Billiard(AnalyticForecast):
         The path is unfolded: each crossing of the table takes 1/e times as long as the one before, so that the number
         of bounces and what is left after the last one follow from a geometric series.
         """
-        half, e = self.half_extent, self.restitution
+        half, e = self._half(place), self.restitution
         heading, speed = torch.where(velocity < 0.0, -1.0, 1.0), velocity.abs()
         to_wall = (half - place * heading).clamp_min(0.0)
         covered = speed * time
@@ -242,20 +254,27 @@ class Billiard(AnalyticForecast):
             "restitution_deviation",
             "deceleration",
             "sliding",
+            "drag",
             "gaps",
             "gone_height",
         )
         return super().part_settings() | {name: getattr(self, name) for name in names}
 
+    def _half(self, like: Tensor) -> Tensor | float:
+        """Where a target turns back [m]: a number, or of an oblong table ``(2,)`` of the type of ``like``."""
+        return like.new_tensor(self.half_extent) if isinstance(self.half_extent, tuple) else self.half_extent
+
     def _slowed(self, history: Tensor, velocity: Tensor, time: Tensor) -> Tensor:
         """How long a target of constant ``velocity`` (*B, 1, 2) would take for what it covers: ``(*B, F, 1)`` [s]."""
         moment = time.unsqueeze(-1)
+        if self.drag > 0.0:
+            return -torch.expm1(-self.drag * moment) / self.drag
         if self.deceleration == self.sliding == 0.0:
             return moment
         speed = velocity.square().sum(-1, keepdim=True).clamp_min(1e-12).sqrt()
         before = self._braking(history)
         place, heading = history[..., -1:, :], torch.where(velocity < 0.0, -1.0, 1.0)
-        waits = (self.half_extent - place * heading).clamp_min(0.0) / velocity.abs().clamp_min(1e-9)
+        waits = (self._half(place) - place * heading).clamp_min(0.0) / velocity.abs().clamp_min(1e-9)
         first, axis = waits.min(-1, keepdim=True)
         # Of the speed across the cushion a share is left, and all of the one along it.
         left = velocity * torch.where(torch.arange(2, device=axis.device) == axis, self.restitution, 1.0)
