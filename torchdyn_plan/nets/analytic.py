@@ -184,9 +184,11 @@ class Billiard(AnalyticForecast):
             settings: those of `AnalyticForecast`.
         """
         super().__init__(**settings)
-        oblong = isinstance(half_extent, Sequence)
-        sides: tuple[float, ...] = check_vector("half_extent", half_extent) if oblong else (half_extent,)
-        if len(sides) > 2:
+        if isinstance(half_extent, Sequence):
+            half_extent = sides = check_vector("half_extent", half_extent)
+        else:
+            sides = (half_extent, half_extent)
+        if len(sides) != 2:
             raise InputError(f"half_extent must be one number or two, along x and y, got {half_extent!r}")
         for side in sides:
             check_number("half_extent", side, minimum=1e-9)
@@ -201,8 +203,8 @@ class Billiard(AnalyticForecast):
         for gap in gaps:
             if len(gap) != 2 or not -min(sides) <= gap[0] < gap[1] <= min(sides):
                 raise InputError(f"gaps must be pairs that rise within ±{min(sides):g}, got {gap!r}")
-        self.half_extent = sides if oblong else sides[0]
-        self.drag, self.restitution, self.restitution_deviation = drag, restitution, restitution_deviation
+        self.half_extent, self.drag = half_extent, drag
+        self.restitution, self.restitution_deviation = restitution, restitution_deviation
         self.deceleration, self.sliding, self.gone_height = deceleration, sliding, gone_height
         self.gaps = tuple((float(first), float(last)) for first, last in gaps)
 
