@@ -1,0 +1,343 @@
+"""The Robot Air Hockey Challenge: our planner beside the organisers' baseline agent, on the same starts.
+
+python benchmarks/air_hockey.py --python /tmp/hockey/bin/python --repository /tmp/air_hockey_challenge \
+    --out benchmarks/results/air_hockey.json
+
+The challenge runs in an environment of its own (docs/air-hockey.md), and answers over a pipe. Ours is a `DynamicPlanner`
+of the package's parts; what knows of mallets and pucks is in this file: `Ahead` of a puck is where a mallet meets it,
+and `SoftContact` gives way as it does. Rows are agents in one of the challenge's tasks; a killed study goes on.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import subprocess
+import time
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any, ClassVar, NamedTuple
+
+import numpy as np
+import torch
+import tyro
+from study import Output, Row, Study, each, measuring, rate_entries
+from tensordict import TensorDict
+from torch import Tensor
+
+from torchdyn_plan.kinematics import Arm
+from torchdyn_plan.kinematics.mjcf import joints_of_mjcf
+from torchdyn_plan.nets import AnalyticArrival, Billiard
+from torchdyn_plan.nets.forecast import Forecast, ForecastModel
+from torchdyn_plan.planners import DynamicPlanner, ExactSearch, IKPlanner, MetWithin, ReplanSchedule
+from torchdyn_plan.planners.observation import Observation
+from torchdyn_plan.planners.plan import Plan
+from torchdyn_plan.planners.static.approach import StraightToGoal
+
+HERE = Path(__file__).parent
+LIMIT = 20.0
+"""An action may take so long [ms]."""
+DRAG, RESTITUTION = 0.497, 0.85
+"""Of the puck on the table [1/s], and between rims; measured in the challenge's simulation."""
+ZONE = -0.8, -0.2
+"""A puck that is at rest between these is defended [m, along the table from its middle]."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Arguments(Output):
+    """Play the same starts with each agent."""
+
+    python: Path
+    """Interpreter of the challenge's environment."""
+    repository: Path | None = None
+    """Folder of the organisers' repository, for the baseline."""
+    tasks: tuple[str, ...] = ("3dof-defend", "7dof-defend")
+    """The challenge's tasks."""
+    agents: tuple[str, ...] = ("ours", "baseline")
+    """Who plays."""
+    episodes: int = 200
+    """Starts."""
+    series: str = "test"
+    """Of the starts: test, or dev while tuning."""
+    first: int = 0
+    """Number of the first start."""
+
+
+class Challenge:
+    """One of the challenge's tasks, in a process of its own that answers line by line."""
+
+    def __init__(self, task: str, arguments: Arguments) -> None:
+        """Start it."""
+        more = [] if arguments.repository is None else [str(arguments.repository.resolve())]
+        command = [str(arguments.python), str(HERE / "air_hockey_side.py"), task, *more]
+        env = {name: value for name, value in os.environ.items() if name != "PYTHONPATH"} | {"OMP_NUM_THREADS": "1"}
+        self.process = subprocess.Popen(command, env=env, text=True, stdin=subprocess.PIPE, stdout=subprocess.PIPE)
+        self.about = self._answer()
+
+    def ask(self, name: str, *arguments: Any) -> Any:
+        """Call a method of its `Side`."""
+        assert self.process.stdin
+        print(json.dumps([name, arguments]), file=self.process.stdin, flush=True)
+        return self._answer()
+
+    def close(self) -> None:
+        """Let the process end."""
+        assert self.process.stdin
+        self.process.stdin.close()
+        self.process.wait()
+
+    def _answer(self) -> Any:
+        assert self.process.stdout
+        line = self.process.stdout.readline()
+        if not line:
+            raise SystemExit("the challenge's process ended; what it said stands above")
+        return json.loads(line)
+
+
+class Ahead(ForecastModel):
+    """Forecasts where a mallet is in the way of a puck: a distance ahead of it, along its path."""
+
+    def __init__(self, puck: ForecastModel, distance: float) -> None:
+        """Be ``distance`` [m] ahead of what ``puck`` forecasts."""
+        super().__init__()
+        self.puck, self.distance = puck, distance
+        self.in_keys = puck.in_keys
+
+    def predict(self, *seen: Tensor) -> Forecast:
+        """The puck's path (*B, F, 3), shifted along its tangents."""
+        path = self.puck.predict(*seen).path
+        before = torch.cat([seen[0][..., -1:, :], path[..., :-1, :]], dim=-2)
+        return Forecast(path + self.distance * torch.nn.functional.normalize(path - before, dim=-1))
+
+
+class SoftState(NamedTuple):
+    """Where each row's mallet is sent, and what it is about."""
+
+    soft_place: Tensor
+    """``(*B, D)`` the goal [m, world]."""
+    soft_velocity: Tensor
+    """``(*B, D)`` with which it moves [m per control step]."""
+    soft_left: Tensor
+    """``(*B,)`` int64 control steps to the contact that it is committed to; -1 for none."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class SoftContact:
+    """Moves the mallet into the puck's way, and gives way with a share of its speed when they touch.
+
+    Of a puck with speed v that meets a mallet that gives way with w, the speed (1 + e) w - e v is left: none of it for
+    w = e v / (1 + e). On the way there the goal moves by the cubic through where it is and where it is to be, with
+    both velocities. A puck that comes to rest in the zone by itself is left alone.
+    """
+
+    share: float = 0.27
+    """Share w / v of the puck's speed at contact."""
+    commit_steps: int = 15
+    """Within so many control steps of a contact it is kept."""
+    stop_steps: int = 8
+    """In which the mallet stops after it."""
+    horizon: int = 100
+    """Control steps of the forecast."""
+    zone: tuple[float, float] = (ZONE[0] + 0.03, ZONE[1] - 0.03)
+    """A puck that will rest between these is left alone [m, along x]."""
+    reach: float = DRAG
+    """Drag, from which follows where it will rest [1/s]."""
+    control_step: float = 0.02
+    """[s]"""
+
+    low: tuple[float, ...] = (-0.91, -0.455)
+    """Least coordinates of the mallet [m, world]."""
+    high: tuple[float, ...] = (-0.15, 0.455)
+    """Greatest coordinates."""
+
+    State: ClassVar[type[SoftState]] = SoftState
+
+    @property
+    def lookahead(self) -> int:
+        """The whole forecast, to read the velocity at the contact."""
+        return self.horizon + 1
+
+    def start(self, observation: Observation) -> SoftState:
+        """At rest where the mallet is."""
+        tool = observation.tool_pos
+        return SoftState(tool, torch.zeros_like(tool), torch.full_like(observation.step_count, -1))
+
+    def __call__(
+        self, plan: Plan, observation: Observation, holds: Tensor, state: SoftState
+    ) -> tuple[Tensor, SoftState]:
+        """The goal one step farther on its way."""
+        path = plan.ahead(self.lookahead)
+        left = (state.soft_left - 1).clamp_min(-1)
+        acts = self._threatens(observation) & ~holds
+        near = (left < 0) & acts & (plan.arrival_steps <= self.commit_steps)
+        left = torch.where(near, plan.arrival_steps, left)
+        steps = torch.where(left > 0, left, plan.arrival_steps).clamp(1, self.horizon - 1)
+        end, after = (path.gather(-2, _rows(index, path)).squeeze(-2) for index in (steps, steps + 1))
+        meets = (left > 0) | (acts & (left < 0))
+        place, velocity = cubic_step(state.soft_place, state.soft_velocity, end, self.share * (after - end), steps)
+        slower = state.soft_velocity * (1.0 - 1.0 / self.stop_steps)
+        velocity = torch.where(meets.unsqueeze(-1), velocity, slower)
+        place = torch.where(meets.unsqueeze(-1), place, state.soft_place + slower)
+        level = torch.clamp(place[..., :2], place.new_tensor(self.low), place.new_tensor(self.high))
+        place = torch.cat([level, place[..., 2:]], dim=-1)
+        return place, SoftState(place, velocity, left)
+
+    def _threatens(self, observation: Observation) -> Tensor:
+        """Whether the puck leaves the zone if nobody touches it, ``(*B,)``."""
+        history = observation.seen[0][..., 0]
+        rest = history[..., -1] + (history[..., -1] - history[..., -2]) / (self.control_step * self.reach)
+        return (rest < self.zone[0]) | (rest > self.zone[1])
+
+
+def _rows(index: Tensor, path: Tensor) -> Tensor:
+    return index[..., None, None].expand(*index.shape, 1, path.shape[-1])
+
+
+def cubic_step(place: Tensor, velocity: Tensor, end: Tensor, end_velocity: Tensor, steps: Tensor) -> tuple[Tensor, Tensor]:
+    """Place and velocity (*B, D) one step on along the cubic that is at ``end`` after ``steps`` (*B,)."""
+    count = steps.to(place.dtype).unsqueeze(-1)
+    way = end - place
+    bend = (6.0 * way / count - 4.0 * velocity - 2.0 * end_velocity) / count
+    jerk = (6.0 * (velocity + end_velocity) - 12.0 * way / count) / count.square()
+    return place + velocity + bend / 2.0 + jerk / 6.0, velocity + bend + jerk / 2.0
+
+
+class Agent:
+    """Our planner as the challenge asks it: what is seen in, what the joints are to be and to move at out."""
+
+    def __init__(self, about: Row, **settings: float) -> None:
+        """Plan for the robot and the table that ``about`` describes."""
+        self.about = about
+        self.own = {"share": 0.27, "speed": 0.85, "within": 0.9, "slowdown": 1.3} | settings
+        self.arm = self._arm()
+        self.planner = self._planner().eval()
+        self.start()
+
+    def start(self) -> None:
+        """Begin an episode."""
+        self.state = TensorDict(batch_size=[1])
+        self.joints: Tensor | None = None
+        self.moved: Tensor | None = None
+        self.step_number = 0
+
+    def act(self, seen: Row) -> tuple[list[float], list[float]]:
+        """Joint positions and speeds at the end of this control step."""
+        step, base = self.about["control_step"], self.about["base_x"]
+        if self.joints is None or self.moved is None:
+            self.joints = torch.tensor([seen["joint_pos"]])
+            self.moved = torch.zeros_like(self.joints)
+        height = self.about["height"]
+        puck = torch.tensor([[seen["puck_pos"][0] + base, seen["puck_pos"][1], height]])
+        velocity = torch.tensor([[*seen["puck_vel"][:2], 0.0]])
+        mallet = self.arm(self.joints)[..., :3, 3] + torch.tensor([base, 0.0, 0.0])
+        self.state.update(
+            {
+                "joint_pos": self.joints,
+                "tool_pos": mallet,
+                "target_pos": puck,
+                "target_history": torch.stack([puck - step * velocity, puck], dim=-2),
+                "robot_state": torch.cat([self.joints, self.moved / step], dim=-1),
+                "step_count": torch.tensor([self.step_number]),
+            }
+        )
+        self.planner(self.state)
+        moved = step * self.state["action"] * self.arm.speed_limit
+        # The speed at the end of the step, from its mean and that of the step before.
+        speed = (1.5 * moved - 0.5 * self.moved) / step
+        speed = torch.clamp(speed, -self.arm.speed_limit, self.arm.speed_limit)
+        self.joints, self.moved = self.joints + moved, moved
+        self.step_number += 1
+        return self.joints[0].tolist(), speed[0].tolist()
+
+    def _arm(self) -> Arm:
+        """The robot, with limits a little within those of the challenge."""
+        joints = joints_of_mjcf(self.about["file"], base=self.about["base"], tip=self.about["mallet"])
+        within = self.own["within"]
+        joints = [replace(joint, lower=within * joint.lower, upper=within * joint.upper) for joint in joints]
+        return Arm(joints, speed_limit=[self.own["speed"] * speed for speed in self.about["joint_vel"]])
+
+    def _planner(self) -> DynamicPlanner:
+        about, arm, step = self.about, self.arm, self.about["control_step"]
+        base = (about["base_x"], 0.0, 0.0)
+        static = IKPlanner(arm, approach=StraightToGoal(base_pos=base), control_step=step, gain=1.0, damping=0.005)
+        sides = [side / 2.0 - about["puck_radius"] for side in (about["length"], about["width"])]
+        maneuver = SoftContact(share=self.own["share"], control_step=step)
+        puck = Billiard(sides, horizon=maneuver.horizon, control_step=step, restitution=RESTITUTION, drag=DRAG)
+        return DynamicPlanner(
+            static,
+            Ahead(puck, about["puck_radius"] + about["mallet_radius"]),
+            AnalyticArrival(
+                static,
+                speed=arm.speed_limit,
+                acceleration=about["joint_acc"],
+                control_step=step,
+                slowdown=self.own["slowdown"],
+            ),
+            search=ExactSearch(stride=1, first=1, switching_cost=1.0, margin=1.0),
+            schedule=ReplanSchedule.every(1, first_step=0),
+            maneuver=maneuver,
+            lost=MetWithin(low=(-0.86, -0.45, -1.0), high=(-0.35, 0.45, 1.0)),
+        )
+
+
+def play(challenge: Challenge, agent: Agent, series: str, episode: int) -> Row:
+    """One episode of ours, as `Side.baseline` tells of the baseline's."""
+    seen = challenge.ask("reset", series, episode)
+    agent.start()
+    milliseconds: list[float] = []
+    violated: set[str] = set()
+    while True:
+        begun = time.perf_counter()
+        action = agent.act(seen)
+        milliseconds.append(1e3 * (time.perf_counter() - begun))
+        seen = challenge.ask("step", *action)
+        violated.update(seen["violated"])
+        if seen["over"]:
+            return {"success": seen["success"], "violated": sorted(violated), "milliseconds": milliseconds}
+
+
+def summary(played: Sequence[Row]) -> Row:
+    """Figures of some episodes."""
+    milliseconds = np.concatenate([row["milliseconds"] for row in played])
+    names = sorted({name for row in played for name in row["violated"]})
+    return {
+        **rate_entries("success", sum(row["success"] for row in played), len(played)),
+        "episodes_with_violations": sum(bool(row["violated"]) for row in played),
+        "violations": {name: sum(name in row["violated"] for row in played) for name in names},
+        "ms_mean": float(milliseconds.mean()),
+        "ms_p99": float(np.quantile(milliseconds, 0.99)),
+        "ms_max": float(milliseconds.max()),
+        "episodes_over_limit": sum(max(row["milliseconds"]) > LIMIT for row in played),
+        "steps": float(np.mean([len(row["milliseconds"]) for row in played])),
+        "lost": [number for number, row in enumerate(played) if not row["success"]],
+    }
+
+
+def measure(task: str, agent: str, arguments: Arguments) -> Row:
+    """The row of an agent in a task."""
+    challenge = Challenge(task, arguments)
+    ours = Agent(challenge.about) if agent == "ours" else None
+    played = []
+    for episode in each(range(arguments.first, arguments.first + arguments.episodes), f"{task}, {agent}"):
+        if ours is None:
+            played.append(challenge.ask("baseline", arguments.series, episode))
+        else:
+            played.append(play(challenge, ours, arguments.series, episode))
+    challenge.close()
+    return summary(played)
+
+
+def main(arguments: Arguments) -> None:
+    """Play, save and print."""
+    study = Study(arguments)
+    with measuring():
+        for task in arguments.tasks:
+            for agent in arguments.agents:
+                names = ("episodes", "series", "first")
+                about = {"task": task, "agent": agent} | {name: getattr(arguments, name) for name in names}
+                study.row(about, lambda task=task, agent=agent: measure(task, agent, arguments))
+
+
+if __name__ == "__main__":
+    main(tyro.cli(Arguments))
