@@ -209,7 +209,7 @@ class Agent:
     def __init__(self, about: Row, **settings: float) -> None:
         """Plan for the robot and the table that ``about`` describes."""
         self.about = about
-        self.own = {"share": 0.27, "speed": 0.85, "within": 0.9, "slowdown": 1.3} | settings
+        self.own = {"share": 0.27, "speed": 0.85, "within": 0.9, "slowdown": 1.3, "quick": 1.0} | settings
         self.arm = self._arm()
         self.planner = self._planner().eval()
         self.start()
@@ -270,7 +270,7 @@ class Agent:
             AnalyticArrival(
                 static,
                 speed=arm.speed_limit,
-                acceleration=about["joint_acc"],
+                acceleration=[self.own["quick"] * value for value in about["joint_acc"]],
                 control_step=step,
                 slowdown=self.own["slowdown"],
             ),
