@@ -118,34 +118,33 @@ class SoftState(NamedTuple):
     """``(*B, D)`` the goal [m, world]."""
     soft_velocity: Tensor
     """``(*B, D)`` with which it moves [m per control step]."""
+    soft_tool: Tensor
+    """``(*B, D)`` where the mallet was [m, world]."""
     soft_left: Tensor
     """``(*B,)`` int64 control steps to the contact that it is committed to; -1 for none."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class SoftContact:
-    """Moves the mallet into the puck's way, and gives way with a share of its speed when they touch.
+    """Waits in the puck's way, and gives way with a share of its speed when they touch.
 
     Of a puck with speed v that meets a mallet that gives way with w, the speed (1 + e) w - e v is left: none of it for
-    w = e v / (1 + e). On the way there the goal moves by the cubic through where it is and where it is to be, with
-    both velocities. A puck that comes to rest in the zone by itself is left alone.
+    w = e v / (1 + e). The last ``swing_steps`` before the contact the goal moves by the cubic from where the mallet is
+    to the contact, with both velocities. A puck that comes to rest in the zone by itself is left alone.
     """
 
-    share: float = 0.27
+    share: float
     """Share w / v of the puck's speed at contact."""
-    commit_steps: int = 15
-    """Within so many control steps of a contact it is kept."""
+    swing_steps: int = 6
+    """Control steps in which the mallet takes on its speed."""
     stop_steps: int = 8
-    """In which the mallet stops after it."""
+    """In which it stops after the contact."""
     horizon: int = 100
     """Control steps of the forecast."""
     zone: tuple[float, float] = (ZONE[0] + 0.03, ZONE[1] - 0.03)
     """A puck that will rest between these is left alone [m, along x]."""
-    reach: float = DRAG
-    """Drag, from which follows where it will rest [1/s]."""
     control_step: float = 0.02
     """[s]"""
-
     low: tuple[float, ...] = (-0.91, -0.455)
     """Least coordinates of the mallet [m, world]."""
     high: tuple[float, ...] = (-0.15, 0.455)
@@ -158,36 +157,43 @@ class SoftContact:
         """The whole forecast, to read the velocity at the contact."""
         return self.horizon + 1
 
+    @property
+    def early_steps(self) -> int:
+        """The mallet waits where it would be met so many control steps before the contact: room to take on speed."""
+        return round(0.5 * self.share * self.swing_steps)
+
     def start(self, observation: Observation) -> SoftState:
         """At rest where the mallet is."""
         tool = observation.tool_pos
-        return SoftState(tool, torch.zeros_like(tool), torch.full_like(observation.step_count, -1))
+        return SoftState(tool, torch.zeros_like(tool), tool, torch.full_like(observation.step_count, -1))
 
     def __call__(
         self, plan: Plan, observation: Observation, holds: Tensor, state: SoftState
     ) -> tuple[Tensor, SoftState]:
-        """The goal one step farther on its way."""
-        path = plan.ahead(self.lookahead)
-        left = (state.soft_left - 1).clamp_min(-1)
+        """The goal: where it waits, on its swing, or where it stops."""
+        path, tool = plan.ahead(self.lookahead), observation.tool_pos
         acts = self._threatens(observation) & ~holds
-        near = (left < 0) & acts & (plan.arrival_steps <= self.commit_steps)
-        left = torch.where(near, plan.arrival_steps, left)
-        steps = torch.where(left > 0, left, plan.arrival_steps).clamp(1, self.horizon - 1)
+        left = (state.soft_left - 1).clamp_min(-1)
+        begins = (left < 0) & acts & (plan.arrival_steps <= self.swing_steps)
+        left = torch.where(begins, plan.arrival_steps.clamp_min(1), left)
+        steps = left.clamp(1, self.horizon - 1)
         end, after = (path.gather(-2, _rows(index, path)).squeeze(-2) for index in (steps, steps + 1))
-        meets = (left > 0) | (acts & (left < 0))
-        place, velocity = cubic_step(state.soft_place, state.soft_velocity, end, self.share * (after - end), steps)
+        came = torch.where(begins.unsqueeze(-1), tool, state.soft_place)
+        speed = torch.where(begins.unsqueeze(-1), tool - state.soft_tool, state.soft_velocity)
+        swung, swing = cubic_step(came, speed, end, self.share * (after - end), steps)
         slower = state.soft_velocity * (1.0 - 1.0 / self.stop_steps)
-        velocity = torch.where(meets.unsqueeze(-1), velocity, slower)
-        place = torch.where(meets.unsqueeze(-1), place, state.soft_place + slower)
+        swings, waits = (left > 0).unsqueeze(-1), ((left < 0) & acts).unsqueeze(-1)
+        place = torch.where(swings, swung, torch.where(waits, plan.goal, state.soft_place + slower))
+        velocity = torch.where(swings, swing, torch.where(waits, 0.0, slower))
         level = torch.clamp(place[..., :2], place.new_tensor(self.low), place.new_tensor(self.high))
         place = torch.cat([level, place[..., 2:]], dim=-1)
-        return place, SoftState(place, velocity, left)
+        return place, SoftState(place, velocity, tool, left)
 
     def _threatens(self, observation: Observation) -> Tensor:
-        """Whether the puck leaves the zone if nobody touches it, ``(*B,)``."""
+        """Whether the puck leaves the zone towards the own goal if nobody touches it, ``(*B,)``."""
         history = observation.seen[0][..., 0]
-        rest = history[..., -1] + (history[..., -1] - history[..., -2]) / (self.control_step * self.reach)
-        return (rest < self.zone[0]) | (rest > self.zone[1])
+        rest = history[..., -1] + (history[..., -1] - history[..., -2]) / (self.control_step * DRAG)
+        return rest < self.zone[0]
 
 
 def _rows(index: Tensor, path: Tensor) -> Tensor:
@@ -209,9 +215,10 @@ class Agent:
     def __init__(self, about: Row, **settings: float) -> None:
         """Plan for the robot and the table that ``about`` describes."""
         self.about = about
-        self.own = {"share": 0.27, "speed": 0.85, "within": 0.9, "slowdown": 1.3, "quick": 1.0} | settings
+        self.own = {"share": 0.33, "speed": 0.85, "within": 0.9, "slowdown": 1.1, "quick": 3.0, "front": -0.35, "slack": 3.0, "swing": 6} | settings
         self.arm = self._arm()
         self.planner = self._planner().eval()
+        self.most_change = self.own["quick"] * about["control_step"] ** 2 * torch.tensor(about["joint_acc"])
         self.start()
 
     def start(self) -> None:
@@ -243,6 +250,8 @@ class Agent:
         )
         self.planner(self.state)
         moved = step * self.state["action"] * self.arm.speed_limit
+        change = moved - self.moved
+        moved = self.moved + change / (change.abs() / self.most_change).amax(-1, keepdim=True).clamp_min(1.0)
         # The speed at the end of the step, from its mean and that of the step before.
         speed = (1.5 * moved - 0.5 * self.moved) / step
         speed = torch.clamp(speed, -self.arm.speed_limit, self.arm.speed_limit)
@@ -260,9 +269,12 @@ class Agent:
     def _planner(self) -> DynamicPlanner:
         about, arm, step = self.about, self.arm, self.about["control_step"]
         base = (about["base_x"], 0.0, 0.0)
-        static = IKPlanner(arm, approach=StraightToGoal(base_pos=base), control_step=step, gain=1.0, damping=0.005)
+        quick = [self.own["quick"] * value for value in about["joint_acc"]]
+        static = IKPlanner(
+            arm, approach=StraightToGoal(base_pos=base), control_step=step, acceleration=quick, damping=0.005
+        )
         sides = [side / 2.0 - about["puck_radius"] for side in (about["length"], about["width"])]
-        maneuver = SoftContact(share=self.own["share"], control_step=step)
+        maneuver = SoftContact(share=self.own["share"], swing_steps=int(self.own["swing"]), control_step=step)
         puck = Billiard(sides, horizon=maneuver.horizon, control_step=step, restitution=RESTITUTION, drag=DRAG)
         return DynamicPlanner(
             static,
@@ -270,14 +282,22 @@ class Agent:
             AnalyticArrival(
                 static,
                 speed=arm.speed_limit,
-                acceleration=[self.own["quick"] * value for value in about["joint_acc"]],
+                acceleration=quick,
                 control_step=step,
                 slowdown=self.own["slowdown"],
+                extra_steps=-self.own["slack"],
             ),
-            search=ExactSearch(stride=1, first=1, switching_cost=1.0, margin=1.0),
+            search=ExactSearch(
+                stride=1,
+                first=1,
+                switching_cost=1.0,
+                margin=self.own["slack"],
+                early_steps=maneuver.early_steps,
+                descent_steps=maneuver.swing_steps,
+            ),
             schedule=ReplanSchedule.every(1, first_step=0),
             maneuver=maneuver,
-            lost=MetWithin(low=(-0.86, -0.45, -1.0), high=(-0.35, 0.45, 1.0)),
+            lost=MetWithin(low=(-0.86, -0.45, -1.0), high=(self.own["front"], 0.45, 1.0)),
         )
 
 
@@ -285,12 +305,13 @@ def play(challenge: Challenge, agent: Agent, series: str, episode: int) -> Row:
     """One episode of ours, as `Side.baseline` tells of the baseline's."""
     seen = challenge.ask("reset", series, episode)
     agent.start()
-    milliseconds: list[float] = []
+    milliseconds: list[list[float]] = []
     violated: set[str] = set()
     while True:
-        begun = time.perf_counter()
+        begun = time.perf_counter(), time.process_time()
         action = agent.act(seen)
-        milliseconds.append(1e3 * (time.perf_counter() - begun))
+        taken = time.perf_counter() - begun[0], time.process_time() - begun[1]
+        milliseconds.append([1e3 * seconds for seconds in taken])
         seen = challenge.ask("step", *action)
         violated.update(seen["violated"])
         if seen["over"]:
@@ -305,13 +326,18 @@ def summary(played: Sequence[Row]) -> Row:
         **rate_entries("success", sum(row["success"] for row in played), len(played)),
         "episodes_with_violations": sum(bool(row["violated"]) for row in played),
         "violations": {name: sum(name in row["violated"] for row in played) for name in names},
-        "ms_mean": float(milliseconds.mean()),
-        "ms_p99": float(np.quantile(milliseconds, 0.99)),
-        "ms_max": float(milliseconds.max()),
-        "episodes_over_limit": sum(max(row["milliseconds"]) > LIMIT for row in played),
+        **timing("ms", milliseconds[:, 0]),
+        **timing("processor_ms", milliseconds[:, 1]),
         "steps": float(np.mean([len(row["milliseconds"]) for row in played])),
         "lost": [number for number, row in enumerate(played) if not row["success"]],
     }
+
+
+def timing(name: str, milliseconds: np.ndarray[Any, Any]) -> Row:
+    """Mean, high quantile and greatest of times (A,) of actions, and the share that took too long."""
+    high = {"mean": milliseconds.mean(), "p99": np.quantile(milliseconds, 0.99), "max": milliseconds.max()}
+    late = {f"{name}_late": float((milliseconds > LIMIT).mean())}
+    return {f"{name}_{what}": float(value) for what, value in high.items()} | late
 
 
 def measure(task: str, agent: str, arguments: Arguments) -> Row:
