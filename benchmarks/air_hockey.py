@@ -135,6 +135,8 @@ class SoftContact:
 
     share: float
     """Share w / v of the puck's speed at contact."""
+    commit_steps: int = 15
+    """A contact that is so many control steps away is kept: where it is follows the forecast, when it is does not."""
     swing_steps: int = 6
     """Control steps in which the mallet takes on its speed."""
     stop_steps: int = 8
@@ -174,17 +176,20 @@ class SoftContact:
         path, tool = plan.ahead(self.lookahead), observation.tool_pos
         acts = self._threatens(observation) & ~holds
         left = (state.soft_left - 1).clamp_min(-1)
-        begins = (left < 0) & acts & (plan.arrival_steps <= self.swing_steps)
-        left = torch.where(begins, plan.arrival_steps.clamp_min(1), left)
+        left = torch.where((left < 0) & acts & (plan.arrival_steps <= self.commit_steps), plan.arrival_steps, left)
         steps = left.clamp(1, self.horizon - 1)
         end, after = (path.gather(-2, _rows(index, path)).squeeze(-2) for index in (steps, steps + 1))
-        came = torch.where(begins.unsqueeze(-1), tool, state.soft_place)
-        speed = torch.where(begins.unsqueeze(-1), tool - state.soft_tool, state.soft_velocity)
-        swung, swing = cubic_step(came, speed, end, self.share * (after - end), steps)
+        yields = self.share * (after - end)
+        swings = ((left > 0) & (left <= self.swing_steps)).unsqueeze(-1)
+        fresh = ((state.soft_left <= 0) | (state.soft_left > self.swing_steps)).unsqueeze(-1)
+        came = torch.where(fresh, tool, state.soft_place)
+        speed = torch.where(fresh, tool - state.soft_tool, state.soft_velocity)
+        swung, swing = cubic_step(came, speed, end, yields, steps)
+        waits = torch.where((left > 0).unsqueeze(-1), end - 0.5 * self.swing_steps * yields, plan.goal)
         slower = state.soft_velocity * (1.0 - 1.0 / self.stop_steps)
-        swings, waits = (left > 0).unsqueeze(-1), ((left < 0) & acts).unsqueeze(-1)
-        place = torch.where(swings, swung, torch.where(waits, plan.goal, state.soft_place + slower))
-        velocity = torch.where(swings, swing, torch.where(waits, 0.0, slower))
+        stops = ((left == 0) | ((left < 0) & ~acts)).unsqueeze(-1)
+        place = torch.where(swings, swung, torch.where(stops, state.soft_place + slower, waits))
+        velocity = torch.where(swings, swing, torch.where(stops, slower, 0.0))
         level = torch.clamp(place[..., :2], place.new_tensor(self.low), place.new_tensor(self.high))
         place = torch.cat([level, place[..., 2:]], dim=-1)
         return place, SoftState(place, velocity, tool, left)
@@ -215,7 +220,7 @@ class Agent:
     def __init__(self, about: Row, **settings: float) -> None:
         """Plan for the robot and the table that ``about`` describes."""
         self.about = about
-        self.own = {"share": 0.33, "speed": 0.85, "within": 0.9, "slowdown": 1.1, "quick": 3.0, "front": -0.35, "slack": 3.0, "swing": 6} | settings
+        self.own = {"share": 0.33, "speed": 0.85, "within": 0.9, "slowdown": 1.1, "quick": 3.0, "front": -0.35, "slack": 3.0, "swing": 6, "commit": 15} | settings
         self.arm = self._arm()
         self.planner = self._planner().eval()
         self.most_change = self.own["quick"] * about["control_step"] ** 2 * torch.tensor(about["joint_acc"])
@@ -274,7 +279,7 @@ class Agent:
             arm, approach=StraightToGoal(base_pos=base), control_step=step, acceleration=quick, damping=0.005
         )
         sides = [side / 2.0 - about["puck_radius"] for side in (about["length"], about["width"])]
-        maneuver = SoftContact(share=self.own["share"], swing_steps=int(self.own["swing"]), control_step=step)
+        maneuver = SoftContact(share=self.own["share"], commit_steps=int(self.own["commit"]), swing_steps=int(self.own["swing"]), control_step=step)
         puck = Billiard(sides, horizon=maneuver.horizon, control_step=step, restitution=RESTITUTION, drag=DRAG)
         return DynamicPlanner(
             static,
