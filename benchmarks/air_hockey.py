@@ -3,9 +3,9 @@
 python benchmarks/air_hockey.py --python /tmp/hockey/bin/python --repository /tmp/air_hockey_challenge \
     --out benchmarks/results/air_hockey.json
 
-The challenge runs in an environment of its own (docs/air-hockey.md), and answers over a pipe. Ours is a `DynamicPlanner`
-of the package's parts; what knows of mallets and pucks is in this file: `Ahead` of a puck is where a mallet meets it,
-and `SoftContact` gives way as it does. Rows are agents in one of the challenge's tasks; a killed study goes on.
+The challenge runs in an environment of its own (docs/air-hockey.md), and answers over a pipe. Ours is a
+`DynamicPlanner` of the package's parts; what knows of mallets and pucks is in this file: `Ahead` of a puck is where a
+mallet meets it, and `SoftContact` gives way as it does. Rows are blocks of episodes; a killed study goes on.
 """
 
 from __future__ import annotations
@@ -16,13 +16,14 @@ import subprocess
 import time
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 from typing import Any, ClassVar, NamedTuple
 
 import numpy as np
 import torch
 import tyro
-from study import Output, Row, Study, each, measuring, rate_entries
+from study import Output, Row, Study, each, measuring, rate_entries, told
 from tensordict import TensorDict
 from torch import Tensor
 
@@ -57,11 +58,11 @@ class Arguments(Output):
     agents: tuple[str, ...] = ("ours", "baseline")
     """Who plays."""
     episodes: int = 200
-    """Starts."""
+    """Starts, a multiple of the block."""
+    block: int = 10
+    """Of them in a row."""
     series: str = "test"
     """Of the starts: test, or dev while tuning."""
-    first: int = 0
-    """Number of the first start."""
 
 
 class Challenge:
@@ -205,7 +206,9 @@ def _rows(index: Tensor, path: Tensor) -> Tensor:
     return index[..., None, None].expand(*index.shape, 1, path.shape[-1])
 
 
-def cubic_step(place: Tensor, velocity: Tensor, end: Tensor, end_velocity: Tensor, steps: Tensor) -> tuple[Tensor, Tensor]:
+def cubic_step(
+    place: Tensor, velocity: Tensor, end: Tensor, end_velocity: Tensor, steps: Tensor
+) -> tuple[Tensor, Tensor]:
     """Place and velocity (*B, D) one step on along the cubic that is at ``end`` after ``steps`` (*B,)."""
     count = steps.to(place.dtype).unsqueeze(-1)
     way = end - place
@@ -220,7 +223,17 @@ class Agent:
     def __init__(self, about: Row, **settings: float) -> None:
         """Plan for the robot and the table that ``about`` describes."""
         self.about = about
-        self.own = {"share": 0.33, "speed": 0.85, "within": 0.9, "slowdown": 1.1, "quick": 3.0, "front": -0.35, "slack": 3.0, "swing": 6, "commit": 15} | settings
+        self.own = {
+            "share": 0.33,
+            "speed": 0.85,
+            "within": 0.9,
+            "slowdown": 1.1,
+            "quick": 3.0,
+            "front": -0.35,
+            "slack": 3.0,
+            "swing": 6,
+            "commit": 15,
+        } | settings
         self.arm = self._arm()
         self.planner = self._planner().eval()
         self.most_change = self.own["quick"] * about["control_step"] ** 2 * torch.tensor(about["joint_acc"])
@@ -279,7 +292,12 @@ class Agent:
             arm, approach=StraightToGoal(base_pos=base), control_step=step, acceleration=quick, damping=0.005
         )
         sides = [side / 2.0 - about["puck_radius"] for side in (about["length"], about["width"])]
-        maneuver = SoftContact(share=self.own["share"], commit_steps=int(self.own["commit"]), swing_steps=int(self.own["swing"]), control_step=step)
+        maneuver = SoftContact(
+            share=self.own["share"],
+            commit_steps=int(self.own["commit"]),
+            swing_steps=int(self.own["swing"]),
+            control_step=step,
+        )
         puck = Billiard(sides, horizon=maneuver.horizon, control_step=step, restitution=RESTITUTION, drag=DRAG)
         return DynamicPlanner(
             static,
@@ -323,51 +341,70 @@ def play(challenge: Challenge, agent: Agent, series: str, episode: int) -> Row:
             return {"success": seen["success"], "violated": sorted(violated), "milliseconds": milliseconds}
 
 
-def summary(played: Sequence[Row]) -> Row:
-    """Figures of some episodes."""
-    milliseconds = np.concatenate([row["milliseconds"] for row in played])
-    names = sorted({name for row in played for name in row["violated"]})
+def measure(challenge: Challenge, agent: Agent | None, series: str, first: int, count: int) -> Row:
+    """A block of episodes: which are lost, what is violated in each, and its actions' times; None for the baseline."""
+    played = []
+    for episode in range(first, first + count):
+        if agent is None:
+            played.append(challenge.ask("baseline", series, episode))
+        else:
+            played.append(play(challenge, agent, series, episode))
+    times = np.concatenate([row["milliseconds"] for row in played])
     return {
-        **rate_entries("success", sum(row["success"] for row in played), len(played)),
-        "episodes_with_violations": sum(bool(row["violated"]) for row in played),
-        "violations": {name: sum(name in row["violated"] for row in played) for name in names},
-        **timing("ms", milliseconds[:, 0]),
-        **timing("processor_ms", milliseconds[:, 1]),
-        "steps": float(np.mean([len(row["milliseconds"]) for row in played])),
-        "lost": [number for number, row in enumerate(played) if not row["success"]],
+        "lost": [first + number for number, row in enumerate(played) if not row["success"]],
+        "violated": [row["violated"] for row in played if row["violated"]],
+        "actions": len(times),
+        **timing("ms", times[:, 0]),
+        **timing("processor_ms", times[:, 1]),
     }
 
 
 def timing(name: str, milliseconds: np.ndarray[Any, Any]) -> Row:
-    """Mean, high quantile and greatest of times (A,) of actions, and the share that took too long."""
-    high = {"mean": milliseconds.mean(), "p99": np.quantile(milliseconds, 0.99), "max": milliseconds.max()}
-    late = {f"{name}_late": float((milliseconds > LIMIT).mean())}
+    """Mean and greatest of times (A,) of actions, and how many took too long."""
+    high = {"mean": milliseconds.mean(), "max": milliseconds.max()}
+    late = {f"{name}_late": int((milliseconds > LIMIT).sum())}
     return {f"{name}_{what}": float(value) for what, value in high.items()} | late
 
 
-def measure(task: str, agent: str, arguments: Arguments) -> Row:
-    """The row of an agent in a task."""
-    challenge = Challenge(task, arguments)
-    ours = Agent(challenge.about) if agent == "ours" else None
-    played = []
-    for episode in each(range(arguments.first, arguments.first + arguments.episodes), f"{task}, {agent}"):
-        if ours is None:
-            played.append(challenge.ask("baseline", arguments.series, episode))
-        else:
-            played.append(play(challenge, ours, arguments.series, episode))
-    challenge.close()
-    return summary(played)
+def summary(rows: Sequence[Row]) -> Row:
+    """Figures of all blocks of an agent in a task."""
+    episodes, actions = sum(row["block"] for row in rows), sum(row["actions"] for row in rows)
+    violated = [names for row in rows for names in row["violated"]]
+    found = {
+        "episodes": episodes,
+        **rate_entries("success", episodes - sum(len(row["lost"]) for row in rows), episodes),
+        "episodes_with_violations": len(violated),
+        "violations": {name: sum(name in names for names in violated) for name in sorted(set().union(*violated))},
+    }
+    for name in ("ms", "processor_ms"):
+        found[f"{name}_mean"] = sum(row[f"{name}_mean"] * row["actions"] for row in rows) / actions
+        found[f"{name}_max"] = max(row[f"{name}_max"] for row in rows)
+        found[f"{name}_late"] = sum(row[f"{name}_late"] for row in rows) / actions
+    return found
 
 
 def main(arguments: Arguments) -> None:
     """Play, save and print."""
     study = Study(arguments)
+    challenges = {task: Challenge(task, arguments) for task in arguments.tasks}
+    ours = {task: Agent(challenge.about) for task, challenge in challenges.items()}
+    pairs = [(task, agent) for task in arguments.tasks for agent in arguments.agents]
     with measuring():
-        for task in arguments.tasks:
-            for agent in arguments.agents:
-                names = ("episodes", "series", "first")
-                about = {"task": task, "agent": agent} | {name: getattr(arguments, name) for name in names}
-                study.row(about, lambda task=task, agent=agent: measure(task, agent, arguments))
+        for first in each(range(0, arguments.episodes, arguments.block), "blocks"):
+            for task, agent in pairs:
+                about = {"task": task, "agent": agent, "series": arguments.series}
+                about |= {"first": first, "block": arguments.block}
+                player = ours[task] if agent == "ours" else None
+                given = challenges[task], player, arguments.series, first, arguments.block
+                study.row(about, partial(measure, *given))
+    found = []
+    for task, agent in pairs:
+        own = {"task": task, "agent": agent, "series": arguments.series}
+        found.append(own | summary([row for row in study.rows if own.items() <= row.items()]))
+        print(told(found[-1]))
+    study.save(summary=found)
+    for challenge in challenges.values():
+        challenge.close()
 
 
 if __name__ == "__main__":

@@ -69,8 +69,8 @@ class Side:
 
     def reset(self, series: str, episode: int) -> dict[str, Any]:
         """Begin an episode, the same whenever it is asked for."""
-        np.random.seed([SERIES[series], episode])  # noqa: NPY002  # The environment draws from it.
-        # Its own reset would draw a seed anew.
+        # The environment draws from it; its own reset would seed it anew.
+        np.random.seed([SERIES[series], episode])
         self.seen = self.env.base_env.reset()
         self.step_number = 0
         return self._seen()
@@ -84,7 +84,7 @@ class Side:
         return self._seen() | {"over": over, "success": bool(about["success"]), "violated": violated}
 
     def baseline(self, series: str, episode: int) -> dict[str, Any]:
-        """A whole episode of the organisers' baseline agent: its outcome, and wall and processor time of actions [ms]."""
+        """A whole episode of the organisers' agent: its outcome, and wall and processor time of each action [ms]."""
         self.reset(series, episode)
         self.agent.episode_start()
         milliseconds: list[list[float]] = []

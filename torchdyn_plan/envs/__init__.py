@@ -6,7 +6,7 @@ from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-    from torchdyn_plan.envs.arm_runner import ArmRunner, EnvRunner
+    from torchdyn_plan.envs.arm_runner import ArmRunner, EnvRunner, FunctionRunner
     from torchdyn_plan.envs.episodes import draw_uniform
     from torchdyn_plan.envs.fetch_reach import DynamicReachEnv, FetchSimulation
     from torchdyn_plan.envs.moving_target import MovingTargetEnv, RobotReading
@@ -18,6 +18,7 @@ _PLACES = {
     "DynamicReachEnv": "fetch_reach",
     "EnvRunner": "arm_runner",
     "FetchSimulation": "fetch_reach",
+    "FunctionRunner": "arm_runner",
     "MovingTargetEnv": "moving_target",
     "RobotReading": "moving_target",
     "Sensor": "sensor",
@@ -34,6 +35,7 @@ __all__ = [
     "DynamicReachEnv",
     "EnvRunner",
     "FetchSimulation",
+    "FunctionRunner",
     "MovingTargetEnv",
     "RobotReading",
     "Sensor",
