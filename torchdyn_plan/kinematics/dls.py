@@ -66,7 +66,7 @@ def braked_step(step: Tensor, limit: Tensor, brake: Tensor) -> Tensor:
 
     A joint that goes u in a control step and then brakes stops after u + u²/2b, with b what it can change its step by:
 
-        u = -b + √(b² + 2 b e),  which tends to e where that is small.
+        u = -b + √(b² + 2 b e) = 2 b e / (b + √(b² + 2 b e)),  which tends to e where that is small.
 
     Args:
         step: ``(*B, N)``, the way e that is left.
@@ -74,8 +74,9 @@ def braked_step(step: Tensor, limit: Tensor, brake: Tensor) -> Tensor:
         brake: ``(N,)``, the most that this changes by from one step to the next.
     """
     way = step.abs()
-    allowed = ((brake.square() + 2.0 * brake * way).sqrt() - brake).minimum(limit)
-    share = (allowed / way.clamp_min(1e-12)).amin(dim=-1, keepdim=True)
+    # The second form: in the first a joint that has nearly nothing to go is rounded to no step, and stops all.
+    stops = 2.0 * brake / (brake + (brake.square() + 2.0 * brake * way).sqrt())
+    share = stops.minimum(limit / way.clamp_min(1e-12)).amin(dim=-1, keepdim=True)
     return step * share.clamp(max=1.0)
 
 

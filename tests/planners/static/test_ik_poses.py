@@ -68,6 +68,12 @@ def test_a_braked_step_ends_at_rest_at_its_goal_and_never_brakes_harder_than_it_
     torch.testing.assert_close(steps[:, 0, 1] / steps[:, 0, 0], torch.full((80,), -0.2, dtype=torch.float64))
 
 
+def test_a_joint_with_next_to_nothing_to_go_does_not_stop_the_others():
+    limit, brake = torch.tensor([0.05, 0.04]), torch.tensor([0.003, 0.006])
+    first, second = braked_step(torch.tensor([[0.4, 1e-11], [0.4, 0.0]]), limit, brake)
+    assert first[0] == second[0] > 0.04
+
+
 def test_zeros_leave_the_tool_turned_as_it_is():
     goal = pose_goal(HOME, (0.05, -0.1, 0.05))
     free = torch.cat([goal[:, :3], torch.zeros(2, 4)], dim=-1)
