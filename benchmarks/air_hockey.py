@@ -10,11 +10,12 @@ mallet meets it, and `SoftContact` gives way as it does. Rows are blocks of epis
 
 from __future__ import annotations
 
+import base64
 import json
 import os
 import subprocess
 import time
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
@@ -41,6 +42,8 @@ LIMIT = 20.0
 """An action may take so long [ms]."""
 DRAG, RESTITUTION = 0.497, 0.85
 """Of the puck on the table [1/s], and between rims; measured in the challenge's simulation."""
+SIZE = 360, 270
+"""Of a picture [pixels]."""
 ZONE = -0.8, -0.2
 """A puck that is at rest between these is defended [m, along the table from its middle]."""
 
@@ -63,6 +66,8 @@ class Arguments(Output):
     """Of them in a row."""
     series: str = "test"
     """Of the starts: test, or dev while tuning."""
+    picture: Path | None = None
+    """WebP of our first episodes, drawn in place of a measurement; the challenge's machine needs OpenGL."""
 
 
 class Challenge:
@@ -324,13 +329,21 @@ class Agent:
         )
 
 
-def play(challenge: Challenge, agent: Agent, series: str, episode: int) -> Row:
-    """One episode of ours, as `Side.baseline` tells of the baseline's."""
+def play(
+    challenge: Challenge,
+    agent: Agent,
+    series: str,
+    episode: int,
+    *,
+    each_step: Callable[[int], None] = lambda step: None,
+) -> Row:
+    """One episode of ours, as `Side.baseline` tells of the baseline's; ``each_step`` is called before each."""
     seen = challenge.ask("reset", series, episode)
     agent.start()
     milliseconds: list[list[float]] = []
     violated: set[str] = set()
     while True:
+        each_step(len(milliseconds))
         begun = time.perf_counter(), time.process_time()
         action = agent.act(seen)
         taken = time.perf_counter() - begun[0], time.process_time() - begun[1]
@@ -339,6 +352,26 @@ def play(challenge: Challenge, agent: Agent, series: str, episode: int) -> Row:
         violated.update(seen["violated"])
         if seen["over"]:
             return {"success": seen["success"], "violated": sorted(violated), "milliseconds": milliseconds}
+
+
+def draw(challenge: Challenge, agent: Agent, arguments: Arguments, *, episodes: int = 3, every: int = 2) -> None:
+    """Write a moving picture of some episodes, one after the other."""
+    from PIL import Image
+
+    assert arguments.picture is not None
+    frames: list[Image.Image] = []
+
+    def frame() -> None:
+        picture = base64.b64decode(challenge.ask("picture", *SIZE))
+        frames.append(Image.frombytes("RGB", SIZE, picture))
+
+    for episode in range(episodes):
+        play(challenge, agent, arguments.series, episode, each_step=lambda step: frame() if step % every == 0 else None)
+        frames.extend([frames[-1]] * 15)
+    pause = int(1000 * every * challenge.about["control_step"])
+    frames[0].save(
+        arguments.picture, save_all=True, append_images=frames[1:], duration=pause, loop=0, quality=60, method=6
+    )
 
 
 def measure(challenge: Challenge, agent: Agent | None, series: str, first: int, count: int) -> Row:
@@ -385,6 +418,12 @@ def summary(rows: Sequence[Row]) -> Row:
 
 def main(arguments: Arguments) -> None:
     """Play, save and print."""
+    if arguments.picture is not None:
+        challenge = Challenge(arguments.tasks[0], arguments)
+        with measuring():
+            draw(challenge, Agent(challenge.about), arguments)
+        challenge.close()
+        return
     study = Study(arguments)
     challenges = {task: Challenge(task, arguments) for task in arguments.tasks}
     ours = {task: Agent(challenge.about) for task, challenge in challenges.items()}

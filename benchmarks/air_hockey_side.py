@@ -8,6 +8,7 @@ needs fancy-gym and mushroom-rl, and knows nothing of torchdyn_plan.
 
 from __future__ import annotations
 
+import base64
 import json
 import os
 import sys
@@ -100,8 +101,8 @@ class Side:
                 break
         return {"success": told["success"], "violated": sorted(violated), "milliseconds": milliseconds}
 
-    def picture(self, width: int, height: int) -> list[int]:
-        """What a camera above the near end sees, RGB row by row."""
+    def picture(self, width: int, height: int) -> str:
+        """What a camera above the near end sees, RGB row by row, in base64."""
         import mujoco
 
         base = self.env.base_env
@@ -110,7 +111,7 @@ class Side:
         if not hasattr(self, "renderer"):
             self.renderer = mujoco.Renderer(base._model, height, width)
         self.renderer.update_scene(base._data, camera)
-        return self.renderer.render().reshape(-1).tolist()
+        return base64.b64encode(self.renderer.render().tobytes()).decode()
 
     def _seen(self) -> dict[str, Any]:
         names = ("puck_pos", "puck_vel", "joint_pos", "joint_vel")
