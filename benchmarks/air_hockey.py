@@ -42,6 +42,8 @@ LIMIT = 20.0
 """An action may take so long [ms]."""
 DRAG, RESTITUTION = 0.497, 0.85
 """Of the puck on the table [1/s], and between rims; measured in the challenge's simulation."""
+NOWHERE = 100.0
+"""Where nothing can be met [m]."""
 SIZE = 360, 270
 """Of a picture [pixels]."""
 ZONE = -0.8, -0.2
@@ -102,7 +104,10 @@ class Challenge:
 
 
 class Ahead(ForecastModel):
-    """Forecasts where a mallet is in the way of a puck: a distance ahead of it, along its path."""
+    """Forecasts where a mallet is in the way of a puck: a distance ahead of it, along its path.
+
+    Where the puck does not come nearer to the own goal, there is no such place: it is put out of the world's reach.
+    """
 
     def __init__(self, puck: ForecastModel, distance: float) -> None:
         """Be ``distance`` [m] ahead of what ``puck`` forecasts."""
@@ -114,7 +119,11 @@ class Ahead(ForecastModel):
         """The puck's path (*B, F, 3), shifted along its tangents."""
         path = self.puck.predict(*seen).path
         before = torch.cat([seen[0][..., -1:, :], path[..., :-1, :]], dim=-2)
-        return Forecast(path + self.distance * torch.nn.functional.normalize(path - before, dim=-1))
+        moves = path - before
+        returns = (moves[..., :1] >= 0.0).cummax(-2).values
+        return Forecast(
+            torch.where(returns, NOWHERE, path + self.distance * torch.nn.functional.normalize(moves, dim=-1))
+        )
 
 
 class SoftState(NamedTuple):
@@ -153,9 +162,9 @@ class SoftContact:
     """A puck that will rest between these is left alone [m, along x]."""
     control_step: float = 0.02
     """[s]"""
-    low: tuple[float, ...] = (-0.91, -0.455)
+    low: tuple[float, ...] = (-0.91, -0.46)
     """Least coordinates of the mallet [m, world]."""
-    high: tuple[float, ...] = (-0.15, 0.455)
+    high: tuple[float, ...] = (-0.15, 0.46)
     """Greatest coordinates."""
 
     State: ClassVar[type[SoftState]] = SoftState
@@ -325,7 +334,7 @@ class Agent:
             ),
             schedule=ReplanSchedule.every(1, first_step=0),
             maneuver=maneuver,
-            lost=MetWithin(low=(-0.86, -0.45, -1.0), high=(self.own["front"], 0.45, 1.0)),
+            lost=MetWithin(low=(-0.86, -0.49, -1.0), high=(self.own["front"], 0.49, 1.0)),
         )
 
 
