@@ -150,9 +150,9 @@ class SoftContact:
 
     share: float
     """Share w / v of the puck's speed at contact."""
-    commit_steps: int = 15
+    commit_steps: int
     """A contact that is so many control steps away is kept: where it is follows the forecast, when it is does not."""
-    swing_steps: int = 6
+    swing_steps: int
     """Control steps in which the mallet takes on its speed."""
     stop_steps: int = 8
     """In which it stops after the contact."""
@@ -194,6 +194,8 @@ class SoftContact:
         left = torch.where((left < 0) & acts & (plan.arrival_steps <= self.commit_steps), plan.arrival_steps, left)
         steps = left.clamp(1, self.horizon - 1)
         end, after = (path.gather(-2, _rows(index, path)).squeeze(-2) for index in (steps, steps + 1))
+        gone = (end - tool).abs().amax(-1) > 0.5 * NOWHERE
+        left, acts = left.masked_fill(gone, -1), acts & ~(gone & (left > 0))
         yields = self.share * (after - end)
         swings = ((left > 0) & (left <= self.swing_steps)).unsqueeze(-1)
         fresh = ((state.soft_left <= 0) | (state.soft_left > self.swing_steps)).unsqueeze(-1)
@@ -231,26 +233,39 @@ def cubic_step(
     return place + velocity + bend / 2.0 + jerk / 6.0, velocity + bend + jerk / 2.0
 
 
+@dataclass(frozen=True, kw_only=True)
+class Tuning:
+    """What was chosen on starts of the series dev."""
+
+    share: float = 0.33
+    """Share of the puck's speed with which the mallet gives way."""
+    speed: float = 0.85
+    """Share of the joints' speed limits that is used; beyond 0.95 is a violation."""
+    within: float = 0.9
+    """Share of their position limits; beyond 0.95 is a violation."""
+    quick: float = 3.0
+    """Acceleration of joints, times what the challenge names and does not ask for."""
+    slowdown: float = 1.1
+    """Arrivals take so much longer than the limits allow."""
+    slack_steps: float = 3.0
+    """Control steps by which a mallet may come late to a contact that is kept."""
+    commit_steps: int = 15
+    """As of `SoftContact`."""
+    swing_steps: int = 6
+    """As of `SoftContact`."""
+    front: float = -0.35
+    """The mallet goes no farther to meet a puck [m, along the table from its middle]."""
+
+
 class Agent:
     """Our planner as the challenge asks it: what is seen in, what the joints are to be and to move at out."""
 
-    def __init__(self, about: Row, **settings: float) -> None:
+    def __init__(self, about: Row, own: Tuning = Tuning()) -> None:
         """Plan for the robot and the table that ``about`` describes."""
-        self.about = about
-        self.own = {
-            "share": 0.33,
-            "speed": 0.85,
-            "within": 0.9,
-            "slowdown": 1.1,
-            "quick": 3.0,
-            "front": -0.35,
-            "slack": 3.0,
-            "swing": 6,
-            "commit": 15,
-        } | settings
+        self.about, self.own = about, own
         self.arm = self._arm()
         self.planner = self._planner().eval()
-        self.most_change = self.own["quick"] * about["control_step"] ** 2 * torch.tensor(about["joint_acc"])
+        self.most_change = self.own.quick * about["control_step"] ** 2 * torch.tensor(about["joint_acc"])
         self.start()
 
     def start(self) -> None:
@@ -287,29 +302,30 @@ class Agent:
         # The speed at the end of the step, from its mean and that of the step before.
         speed = (1.5 * moved - 0.5 * self.moved) / step
         speed = torch.clamp(speed, -self.arm.speed_limit, self.arm.speed_limit)
-        self.joints, self.moved = self.joints + moved, moved
+        joints = self.joints + moved
+        self.joints, self.moved = joints, moved
         self.step_number += 1
-        return self.joints[0].tolist(), speed[0].tolist()
+        return joints[0].tolist(), speed[0].tolist()
 
     def _arm(self) -> Arm:
         """The robot, with limits a little within those of the challenge."""
         joints = joints_of_mjcf(self.about["file"], base=self.about["base"], tip=self.about["mallet"])
-        within = self.own["within"]
+        within = self.own.within
         joints = [replace(joint, lower=within * joint.lower, upper=within * joint.upper) for joint in joints]
-        return Arm(joints, speed_limit=[self.own["speed"] * speed for speed in self.about["joint_vel"]])
+        return Arm(joints, speed_limit=[self.own.speed * speed for speed in self.about["joint_vel"]])
 
     def _planner(self) -> DynamicPlanner:
         about, arm, step = self.about, self.arm, self.about["control_step"]
         base = (about["base_x"], 0.0, 0.0)
-        quick = [self.own["quick"] * value for value in about["joint_acc"]]
+        quick = [self.own.quick * value for value in about["joint_acc"]]
         static = IKPlanner(
             arm, approach=StraightToGoal(base_pos=base), control_step=step, acceleration=quick, damping=0.005
         )
         sides = [side / 2.0 - about["puck_radius"] for side in (about["length"], about["width"])]
         maneuver = SoftContact(
-            share=self.own["share"],
-            commit_steps=int(self.own["commit"]),
-            swing_steps=int(self.own["swing"]),
+            share=self.own.share,
+            commit_steps=self.own.commit_steps,
+            swing_steps=self.own.swing_steps,
             control_step=step,
         )
         puck = Billiard(sides, horizon=maneuver.horizon, control_step=step, restitution=RESTITUTION, drag=DRAG)
@@ -321,20 +337,20 @@ class Agent:
                 speed=arm.speed_limit,
                 acceleration=quick,
                 control_step=step,
-                slowdown=self.own["slowdown"],
-                extra_steps=-self.own["slack"],
+                slowdown=self.own.slowdown,
+                extra_steps=-self.own.slack_steps,
             ),
             search=ExactSearch(
                 stride=1,
                 first=1,
                 switching_cost=1.0,
-                margin=self.own["slack"],
+                margin=self.own.slack_steps,
                 early_steps=maneuver.early_steps,
                 descent_steps=maneuver.swing_steps,
             ),
             schedule=ReplanSchedule.every(1, first_step=0),
             maneuver=maneuver,
-            lost=MetWithin(low=(-0.86, -0.49, -1.0), high=(self.own["front"], 0.49, 1.0)),
+            lost=MetWithin(low=(-0.86, -0.49, -1.0), high=(self.own.front, 0.49, 1.0)),
         )
 
 
