@@ -42,6 +42,7 @@ SMALL = {
     "view": "--shown chase:pursuit --seconds 0.5",
 }
 ELSEWHERE = {
+    "air_hockey",
     "descriptions",
     "deviations",
     "drive_page",
@@ -53,9 +54,9 @@ ELSEWHERE = {
     "policy_peers",
     "same_episodes",
 }
-"""Minutes at the least, files of other packages, a picture of trainings, what the package's own arrival map is made by,
-a browser, or a comparison of files."""
-PARTS = {"arms", "former_latency_side", "sides", "study"}
+"""Minutes at the least, another environment, files of other packages, a picture of trainings, what the package's own
+arrival map is made by, a browser, or a comparison of files."""
+PARTS = {"air_hockey_side", "arms", "former_latency_side", "sides", "study"}
 """No scripts of their own."""
 
 

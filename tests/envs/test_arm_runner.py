@@ -1,11 +1,12 @@
 """Robots of any environment driven to goals, its targets left alone."""
 
+import numpy as np
 import pytest
 import torch
 from tensordict import TensorDict
 
 from tests.envs.points import STRIDE, PointEnv
-from torchdyn_plan.envs import EnvRunner
+from torchdyn_plan.envs import EnvRunner, FunctionRunner
 from torchdyn_plan.errors import InputError
 from torchdyn_plan.planners import ProportionalController
 
@@ -57,3 +58,68 @@ def test_the_planner_is_shown_goal_step_and_its_own_memory():
 def test_a_radius_that_is_none_is_refused():
     with pytest.raises(InputError, match="radius"):
         EnvRunner(ProportionalController(gain=1.0), PointEnv(), radius=-1.0)
+
+
+def points(**changes):
+    """Points that functions move, a stride a step: `FunctionRunner`'s arguments."""
+    place = torch.zeros(3, 3)
+
+    def entries():
+        return {"tool_pos": place.clone(), "robot_state": place.clone()}
+
+    def start():
+        place.zero_()
+        return entries()
+
+    def step(action):
+        place.add_(STRIDE * action / action.norm(dim=-1, keepdim=True).clamp_min(1.0))
+        return entries()
+
+    return {"start": start, "step": step, "radius": 0.02} | changes
+
+
+def test_functions_move_robots_as_an_environment_does():
+    runner = FunctionRunner(ProportionalController(gain=1.0 / STRIDE), **points())
+    assert arrivals(runner) == [6, 3, -1]
+    runner.reset()
+    assert torch.equal(runner.robot_state, torch.zeros(3, 3))
+    assert arrivals(runner) == [6, 3, -1]
+
+
+class PointVector:
+    """Gymnasium's vector environments as far as a runner looks at them: points, and an end of their episodes."""
+
+    def __init__(self, steps):
+        self.steps, self.of = steps, points()
+
+    def reset(self):
+        self.count = 0
+        return self._seen(self.of["start"]()), {}
+
+    def step(self, action):
+        self.count += 1
+        ended = np.full(3, self.count >= self.steps)
+        return self._seen(self.of["step"](torch.from_numpy(action))), np.zeros(3), ended & False, ended, {}
+
+    @staticmethod
+    def _seen(entries):
+        place = entries["tool_pos"].double().numpy()
+        return {"observation": place, "achieved_goal": place, "desired_goal": place}
+
+
+def test_gymnasium_environments_move_robots_until_an_episode_ends():
+    planner = ProportionalController(gain=1.0 / STRIDE)
+    assert arrivals(FunctionRunner.of_gym(planner, PointVector(50), radius=0.02)) == [6, 3, -1]
+    with pytest.raises(InputError, match="an episode of the environments ended within a sequence"):
+        arrivals(FunctionRunner.of_gym(planner, PointVector(10), radius=0.02))
+
+
+def test_functions_that_tell_too_little_are_refused():
+    planner, place = ProportionalController(gain=1.0), torch.zeros(3, 3)
+    with pytest.raises(InputError, match="what start returns lacks robot_state"):
+        FunctionRunner(planner, **points(start=lambda: {"tool_pos": place}))
+    with pytest.raises(InputError, match="tool_pos"):
+        FunctionRunner(planner, **points(start=lambda: {"tool_pos": place, "robot_state": place[:2]}))
+    runner = FunctionRunner(planner, **points(step=lambda action: {"robot_state": place}))
+    with pytest.raises(InputError, match="what step returns lacks tool_pos"):
+        runner.step(GOALS)

@@ -1,5 +1,7 @@
 """Forecasts by mechanics beside motions worked out step by step."""
 
+import math
+
 import pytest
 import torch
 
@@ -28,16 +30,17 @@ def history(place, velocity, count=24):
     return place.unsqueeze(-2) + ago * velocity.unsqueeze(-2)
 
 
-def simulated(place, velocity, seconds, *, half=HALF, e=1.0, fine=20):
+def simulated(place, velocity, seconds, *, half=(HALF, HALF), e=1.0, drag=0.0, fine=20):
     """A ball that is rolled in small steps and mirrored at each cushion, at every control step (T, 3)."""
     place, velocity, found = place.clone(), velocity.clone(), []
     small = STEP / fine
     for index in range(round(seconds / STEP) * fine):
-        place = place + small * velocity
+        place = place + small * velocity * (1.0 - 0.5 * drag * small)
+        velocity = velocity * math.exp(-drag * small)
         for axis in (0, 1):
-            if place[axis].abs() > half:
-                over = place[axis].abs() - half
-                place[axis] = place[axis].sign() * (half - e * over)
+            if place[axis].abs() > half[axis]:
+                over = place[axis].abs() - half[axis]
+                place[axis] = place[axis].sign() * (half[axis] - e * over)
                 velocity[axis] = -e * velocity[axis]
         if (index + 1) % fine == 0:
             found.append(place.clone())
@@ -80,6 +83,18 @@ def test_a_ball_is_mirrored_again_and_again(e, velocity):
     wanted = simulated(place, velocity, 1.2, e=e)
     torch.testing.assert_close(path, wanted, rtol=0.0, atol=1e-6)
     assert path[:, :2].abs().max() <= HALF
+
+
+def test_a_puck_on_air_loses_its_speed_on_an_oblong_table():
+    place = torch.tensor([0.5, -0.3, 0.04], dtype=torch.float64)
+    velocity = torch.tensor([-2.5, 1.1, 0.0], dtype=torch.float64)
+    model = Billiard((0.9, 0.4), restitution=0.8, drag=0.5, horizon=300)
+    path = model.predict(history(place, velocity)).path
+    wanted = simulated(place, velocity, 1.2, half=(0.9, 0.4), e=0.8, drag=0.5)
+    torch.testing.assert_close(path, wanted, rtol=0.0, atol=1e-5)
+    assert (path[:, :2].abs().amax(0) <= torch.tensor([0.9, 0.4])).all()
+    again = type(model)(**model.part_settings()).predict(history(place, velocity)).path
+    torch.testing.assert_close(again, path, rtol=0.0, atol=0.0)
 
 
 def test_a_ball_slows_down_and_stops():
@@ -192,6 +207,11 @@ def test_it_is_told_by_its_settings(model):
         (lambda: Ballistic(drag=-0.1), "drag must be >= 0, got -0.1"),
         (lambda: Billiard(0.0), "half_extent must be >= 1e-09, got 0.0"),
         (lambda: Billiard(1.0, restitution=1.2), r"restitution must be in \[0.01, 1\], got 1.2"),
+        (
+            lambda: Billiard((1.0, 0.5, 0.5)),
+            "half_extent must be one number or two",
+        ),
+        (lambda: Billiard(1.0, drag=0.5, sliding=0.1), "a table has drag or decelerations, got 0.5, 0 and 0.1"),
         (lambda: Billiard(1.0, gaps=[(0.5, 0.2)]), r"gaps must be pairs that rise within ±1, got \(0.5, 0.2\)"),
         (lambda: ConstantVelocity().predict(torch.zeros(3, 24, 4)), "target_history must have shape"),
         (

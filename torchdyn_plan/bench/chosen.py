@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-import inspect
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -13,7 +12,7 @@ from torchdyn_plan.checks import check_choice
 from torchdyn_plan.errors import InputError, TorchdynPlanError
 from torchdyn_plan.evaluation.episodes import Planner
 from torchdyn_plan.planners import DynamicPlanner, ExactSearch, shipped_planners
-from torchdyn_plan.tasks import DEFAULT, Task, import_place, load_task, task_names
+from torchdyn_plan.tasks import DEFAULT, Task, import_planner, load_task, task_names
 
 COARSE = 4
 """Coarseness of the exact searches that are also timed from coarse to fine."""
@@ -87,7 +86,7 @@ class Source:
             return task.static_planner(name)
         if not Path(name).is_dir():
             if ":" in name:
-                return _import_planner(name)
+                return import_planner(name)
             check_choice(f"planner of {task.name}", name, {*task.planners, *task.static_planners, *shipped_planners()})
         return DynamicPlanner.from_pretrained(name)
 
@@ -112,14 +111,6 @@ class Source:
         if self.task is not None or scene in (None, self.home.digest()):
             return self.home
         return next((task for task in _tasks_in_all_scenes() if _scene_of(task) == scene), self.home)
-
-
-def _import_planner(place: str) -> Planner:
-    """The planner at ``package.module:NAME``, or the result of the function there."""
-    found = import_place(place, "planner")
-    is_maker = inspect.isfunction(found) and not inspect.signature(found).parameters
-    maker: Callable[[], Any] = found
-    return maker() if is_maker else found
 
 
 def _tasks_in_all_scenes() -> Iterator[Task]:

@@ -196,6 +196,9 @@ class CollectArguments(Arguments):
     """Folder for the shards of data; runs/data/TASK-STATIC when not given."""
     weights: Path | None = None
     """Weights of a static planner that is a policy: file, or folder of its training; the shipped ones by default."""
+    planner: str = ""
+    """Your own static planner whose arrivals are measured, in place of --static: package.module:NAME, or a function
+    there that makes one."""
     tracks: Path | None = None
     episodes: int = 20000
     """Number of targets, or of sequences of runs of the static planner."""

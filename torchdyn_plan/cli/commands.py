@@ -29,7 +29,7 @@ from torchdyn_plan.cli.arguments import (
 )
 from torchdyn_plan.cli.output import say
 from torchdyn_plan.errors import InputError, OutputError
-from torchdyn_plan.tasks import Task
+from torchdyn_plan.tasks import Task, import_planner
 
 if TYPE_CHECKING:
     from torchdyn_plan.envs.sensor import Sensor
@@ -50,7 +50,7 @@ def with_folders(task: Task, arguments: Any) -> Any:
     if isinstance(arguments, (CollectArguments, FitArguments)) and arguments.static:
         check_choice(f"static planner of {task.name}", arguments.static, task.static_planners)
     if isinstance(arguments, CollectArguments):
-        static = arguments.static or task.default_static
+        static = arguments.planner or arguments.static or task.default_static
         return replace(arguments, out=arguments.out or default_folder(DATA, task.weights_name, static))
     if isinstance(arguments, FitArguments):
         static = arguments.static or task.default_static
@@ -114,6 +114,9 @@ def collect(task: Task, arguments: CollectArguments) -> None:
     assert arguments.out is not None
     if arguments.tracks is not None and arguments.what != "paths":
         raise InputError(f"--from is of paths, not of {arguments.what}")
+    if arguments.planner and arguments.what != "arrivals":
+        raise InputError(f"--planner is of arrivals, not of {arguments.what}")
+    own = {"planner": import_planner(arguments.planner), "name": arguments.planner} if arguments.planner else {}
     check_writable_folder(arguments.out)
     if arguments.tracks is not None:
         count = collect_tracks(task, arguments.tracks, arguments.out, seed=arguments.seed)
@@ -130,6 +133,7 @@ def collect(task: Task, arguments: CollectArguments) -> None:
         num_threads=arguments.threads,
         static=arguments.static,
         weights=arguments.weights,
+        **own,
     )
 
 

@@ -5,7 +5,7 @@ from typing import TYPE_CHECKING
 from torchdyn_plan.lazy import lazy_names
 
 if TYPE_CHECKING:
-    from torchdyn_plan.envs.arm_runner import ArmRunner, EnvRunner
+    from torchdyn_plan.envs.arm_runner import ArmRunner, EnvRunner, FunctionRunner
     from torchdyn_plan.envs.episodes import draw_uniform
     from torchdyn_plan.envs.fetch_reach import DynamicReachEnv, FetchSimulation
     from torchdyn_plan.envs.moving_target import MovingTargetEnv, RobotReading
@@ -17,6 +17,7 @@ __all__ = [
     "DynamicReachEnv",
     "EnvRunner",
     "FetchSimulation",
+    "FunctionRunner",
     "MovingTargetEnv",
     "RobotReading",
     "Sensor",
@@ -30,7 +31,7 @@ __all__ = [
 __getattr__, __dir__ = lazy_names(
     __name__,
     {
-        "arm_runner": ("ArmRunner", "EnvRunner"),
+        "arm_runner": ("ArmRunner", "EnvRunner", "FunctionRunner"),
         "episodes": ("draw_uniform",),
         "fetch_reach": ("DynamicReachEnv", "FetchSimulation"),
         "moving_target": ("MovingTargetEnv", "RobotReading"),

@@ -3,15 +3,17 @@
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
+from typing import Any
 
 import torch
 from tensordict import TensorDict, TensorDictBase
 from torch import Tensor
 
 from torchdyn_plan import keys
-from torchdyn_plan.checks import check_number
+from torchdyn_plan.checks import check_number, check_trailing_shape
 from torchdyn_plan.envs.moving_target import MovingTargetEnv
+from torchdyn_plan.errors import InputError
 
 
 class ArmRunner(ABC):
@@ -104,3 +106,89 @@ class EnvRunner(ArmRunner):
     def is_reached(self, goal: Tensor) -> Tensor:
         """Whether each tool is within the radius of ``goal`` (N, 3) [m, world]: ``(N,)`` bool."""
         return (self._seen[keys.TOOL_POS] - goal).norm(dim=-1) <= self.radius
+
+
+class FunctionRunner(ArmRunner):
+    """Robots that a person's own functions start and move: a simulator, a Gymnasium environment, a laboratory."""
+
+    def __init__(
+        self,
+        planner: Callable[[TensorDictBase], TensorDictBase],
+        *,
+        start: Callable[[], Mapping[str, Tensor]],
+        step: Callable[[Tensor], Mapping[str, Tensor]],
+        radius: float,
+    ) -> None:
+        """Drive the N robots that ``start`` puts at their start.
+
+        Args:
+            planner: static planner.
+            start: starts all robots, and returns what the planner sees of them: at least ``tool_pos`` (N, 3) [m, world]
+                and ``robot_state`` (N, S).
+            step: lets a control step pass under an action (N, A), and returns the same entries.
+            radius: a robot whose tool is within it of its goal has arrived [m].
+
+        Raises:
+            InputError: the functions return other entries, or the radius is no such number.
+        """
+        check_number("radius", radius, minimum=0.0)
+        self.start_robots, self.step_robots, self.radius = start, step, radius
+        self._seen = self._checked(start(), "start")
+        super().__init__(planner, len(self._seen[keys.TOOL_POS]))
+
+    @classmethod
+    def of_gym(cls, planner: Callable[[TensorDictBase], TensorDictBase], envs: Any, *, radius: float) -> FunctionRunner:
+        """Drive the robots of a vector of Gymnasium environments.
+
+        Args:
+            planner: static planner.
+            envs: a ``gymnasium.vector.VectorEnv`` with the observations of goal environments: ``observation`` (N, S)
+                is the robot's state, ``achieved_goal`` (N, 3) the tool's place [m]. Its own goals are not looked at.
+                Its episodes must be longer than the sequences of runs.
+            radius: a robot whose tool is within it of its goal has arrived [m].
+
+        Raises:
+            InputError: observations are others; later, an episode ended.
+        """
+
+        def entries(observation: Any) -> dict[str, Tensor]:
+            names = {keys.ROBOT_STATE: "observation", keys.TOOL_POS: "achieved_goal"}
+            missing = [name for name in names.values() if name not in observation]
+            if missing:
+                raise InputError(f"observations of the environments lack {', '.join(missing)}")
+            return {key: torch.tensor(observation[name], dtype=torch.float32) for key, name in names.items()}
+
+        def step(action: Tensor) -> dict[str, Tensor]:
+            observation, _, terminated, truncated, _ = envs.step(action.cpu().numpy())
+            if terminated.any() or truncated.any():
+                raise InputError("an episode of the environments ended within a sequence of runs: lift its time limit")
+            return entries(observation)
+
+        return cls(planner, start=lambda: entries(envs.reset()[0]), step=step, radius=radius)
+
+    def _put_at_start(self) -> None:
+        self._seen = self._checked(self.start_robots(), "start")
+
+    @property
+    def robot_state(self) -> Tensor:
+        """What the functions say, ``(N, S)``."""
+        return self._seen[keys.ROBOT_STATE]
+
+    def _observed(self) -> dict[str, Tensor]:
+        return dict(self._seen)
+
+    def _drive(self, action: Tensor) -> None:
+        self._seen = self._checked(self.step_robots(action), "step")
+
+    def is_reached(self, goal: Tensor) -> Tensor:
+        """Whether each tool is within the radius of ``goal`` (N, 3) [m, world]: ``(N,)`` bool."""
+        return (self._seen[keys.TOOL_POS] - goal).norm(dim=-1) <= self.radius
+
+    @staticmethod
+    def _checked(entries: Mapping[str, Tensor], function: str) -> Mapping[str, Tensor]:
+        missing = [key for key in (keys.TOOL_POS, keys.ROBOT_STATE) if key not in entries]
+        if missing:
+            raise InputError(f"what {function} returns lacks {', '.join(missing)}")
+        state = entries[keys.ROBOT_STATE]
+        check_trailing_shape(keys.TOOL_POS, entries[keys.TOOL_POS], len(state), entries[keys.TOOL_POS].shape[-1])
+        return entries

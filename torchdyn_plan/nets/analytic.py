@@ -173,40 +173,54 @@ class Billiard(AnalyticForecast):
 
     def __init__(
         self,
-        half_extent: float,
+        half_extent: float | Sequence[float],
         *,
         restitution: float = 0.9,
         restitution_deviation: float = 0.03,
         deceleration: float = 0.0,
         sliding: float = 0.0,
+        drag: float = 0.0,
         gaps: Sequence[tuple[float, float]] = (),
         gone_height: float = -0.1,
         **settings: Any,
     ) -> None:
-        """Roll between cushions at ±``half_extent``, where the target's centre turns back along x and along y [m].
+        """Roll between cushions at ±``half_extent``, where the target's centre turns back [m].
 
         Args:
-            half_extent: as above.
+            half_extent: as above, one number for a square table, or two, along x and y.
             restitution: restitution coefficient normal to a cushion; tangential speed is kept.
             restitution_deviation: its standard deviation.
             deceleration: of a rolling target [m/s²].
             sliding: deceleration of a target that slides after a bounce, until it rolls again [m/s²]. Whether it slides
                 now is estimated from its history.
+            drag: share of its speed that a target on an air cushion loses per second [1/s]; it replaces both
+                decelerations.
             gaps: first and last coordinate of each gap along each of the four cushions [m].
             gone_height: height of a target that fell through [m, world].
             settings: settings of `AnalyticForecast`.
         """
         super().__init__(**settings)
-        check_number("half_extent", half_extent, minimum=1e-9)
+        if isinstance(half_extent, Sequence):
+            half_extent = sides = check_vector("half_extent", half_extent)
+        else:
+            sides = (half_extent, half_extent)
+        if len(sides) != 2:
+            raise InputError(f"half_extent must be one number or two, along x and y, got {half_extent!r}")
+        for side in sides:
+            check_number("half_extent", side, minimum=1e-9)
         check_number("restitution", restitution, minimum=0.01, maximum=1.0)
         check_number("restitution_deviation", restitution_deviation, minimum=0.0)
         check_number("deceleration", deceleration, minimum=0.0)
         check_number("sliding", sliding, minimum=0.0)
+        check_number("drag", drag, minimum=0.0)
+        if drag and (deceleration or sliding):
+            raise InputError(f"a table has drag or decelerations, got {drag:g}, {deceleration:g} and {sliding:g}")
         check_number("gone_height", gone_height)
         for gap in gaps:
-            if len(gap) != 2 or not -half_extent <= gap[0] < gap[1] <= half_extent:
-                raise InputError(f"gaps must be pairs that rise within ±{half_extent:g}, got {gap!r}")
-        self.half_extent, self.restitution, self.restitution_deviation = half_extent, restitution, restitution_deviation
+            if len(gap) != 2 or not -min(sides) <= gap[0] < gap[1] <= min(sides):
+                raise InputError(f"gaps must be pairs that rise within ±{min(sides):g}, got {gap!r}")
+        self.half_extent, self.drag = half_extent, drag
+        self.restitution, self.restitution_deviation = restitution, restitution_deviation
         self.deceleration, self.sliding, self.gone_height = deceleration, sliding, gone_height
         self.gaps = tuple((float(first), float(last)) for first, last in gaps)
 
@@ -230,7 +244,7 @@ class Billiard(AnalyticForecast):
         The path is unreflected: each crossing of the table takes 1/e times as long as the last, so that the number of
         bounces and the remainder after the last one follow from a geometric series.
         """
-        half, e = self.half_extent, self.restitution
+        half, e = self._half(place), self.restitution
         heading, speed = torch.where(velocity < 0.0, -1.0, 1.0), velocity.abs()
         to_wall = (half - place * heading).clamp_min(0.0)
         covered = speed * time
@@ -258,20 +272,27 @@ class Billiard(AnalyticForecast):
             "restitution_deviation",
             "deceleration",
             "sliding",
+            "drag",
             "gaps",
             "gone_height",
         )
         return super().part_settings() | {name: getattr(self, name) for name in names}
 
+    def _half(self, like: Tensor) -> Tensor | float:
+        """Where a target turns back [m]: a number, or of an oblong table ``(2,)`` of the type of ``like``."""
+        return like.new_tensor(self.half_extent) if isinstance(self.half_extent, tuple) else self.half_extent
+
     def _slowed(self, history: Tensor, velocity: Tensor, time: Tensor) -> Tensor:
         """Time in which a target at constant ``velocity`` (*B, 1, 2) covers the same distance: ``(*B, F, 1)`` [s]."""
         moment = time.unsqueeze(-1)
+        if self.drag > 0.0:
+            return -torch.expm1(-self.drag * moment) / self.drag
         if self.deceleration == self.sliding == 0.0:
             return moment
         speed = velocity.square().sum(-1, keepdim=True).clamp_min(1e-12).sqrt()
         before = self._braking(history)
         place, heading = history[..., -1:, :], torch.where(velocity < 0.0, -1.0, 1.0)
-        waits = (self.half_extent - place * heading).clamp_min(0.0) / velocity.abs().clamp_min(1e-9)
+        waits = (self._half(place) - place * heading).clamp_min(0.0) / velocity.abs().clamp_min(1e-9)
         first, axis = waits.min(-1, keepdim=True)
         # Part of the normal speed is left, and all of the tangential speed.
         left = velocity * torch.where(torch.arange(2, device=axis.device) == axis, self.restitution, 1.0)

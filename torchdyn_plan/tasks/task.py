@@ -10,6 +10,7 @@ import dataclasses
 import importlib
 import importlib.metadata
 import importlib.util
+import inspect
 import pkgutil
 import sys
 from collections.abc import Callable, Mapping, Sequence
@@ -405,6 +406,21 @@ def import_place(place: str, what: str) -> Any:
         return getattr(importlib.import_module(module), attribute)
     except (ImportError, AttributeError, ValueError) as error:
         raise InputError(f"no {what} at {place!r}: {error}") from error
+
+
+def import_planner(place: str) -> Any:
+    """The planner at ``place``, ``package.module:NAME``, or what the function there makes of nothing.
+
+    Raises:
+        InputError: there is none.
+    """
+    found = import_place(place, "planner")
+    is_maker = inspect.isfunction(found) and not inspect.signature(found).parameters
+    made = found() if is_maker else found
+    if isinstance(made, type) or not callable(made):
+        kind = f"the class {made.__name__}" if isinstance(made, type) else type(made).__name__
+        raise InputError(f"a planner takes and returns a tensordict, but {place!r} is {kind}")
+    return made
 
 
 def _import_task(place: str) -> Task:

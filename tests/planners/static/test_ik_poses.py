@@ -93,6 +93,12 @@ def test_a_round_tool_turns_about_its_own_axis_as_its_joints_like(how):
     torch.testing.assert_close(found[:, 5], HOME[:, 5], rtol=0.0, atol=1e-4)
 
 
+def test_a_joint_with_next_to_nothing_to_go_does_not_stop_the_others():
+    limit, brake = torch.tensor([0.05, 0.04]), torch.tensor([0.003, 0.006])
+    first, second = braked_step(torch.tensor([[0.4, 1e-11], [0.4, 0.0]]), limit, brake)
+    assert first[0] == second[0] > 0.04
+
+
 def test_zeros_leave_the_tool_turned_as_it_is():
     goal = pose_goal(HOME, (0.05, -0.1, 0.05))
     free = torch.cat([goal[:, :3], torch.zeros(2, 4)], dim=-1)
