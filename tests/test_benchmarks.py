@@ -8,6 +8,7 @@ from pathlib import Path
 import pytest
 
 from tests.scripts import run
+from torchdyn_plan.errors import InputError
 from torchdyn_plan.tasks import load_task
 
 BENCHMARKS = Path(__file__).parent.parent / "benchmarks"
@@ -21,6 +22,7 @@ SMALL = {
     "ceiling": "--velocities 5 --episodes 3 --spacing 60 --meetings 1 --leads 7 --rows 64 --split dev",
     "count_calls": "--planners corner --batch 2",
     "diagnose": "--velocities 3 --episodes 4 --arrivals network --split dev",
+    "final": "--rehearse --velocities 5 --planners untrained --episodes 2 --num-envs 2",
     "following": "--arms ur5 --paths 2 --steps 6",
     "forecast_gain": "--episodes 2 --seeds 0 --velocity 5",
     "former_latency": "--former . --planners corner --statics ik --processes 1 --rounds 1 --seconds 0.01 --calls plan",
@@ -62,6 +64,7 @@ LONG = {
     "ablation",
     "braking",
     "calibration",
+    "final",
     "following",
     "forecast_gain",
     "former_latency",
@@ -197,6 +200,50 @@ def test_changes_are_paired(study):
     low, high = study.change_entries(before, after)["change_ci"]
     assert low < 0.1 < high
     assert study.change_entries(before, before)["change"] == 0.0
+    # One episode lost and two won: 2 (1 + 3) / 2³.
+    assert study.change_entries(before, after)["change_p"] == 1.0
+    many = {"solvable": 100, "lost": list(range(10))}
+    assert study.change_entries(many, many | {"lost": [0]})["change_p"] == pytest.approx(2 / 2**9)
+
+
+@pytest.fixture
+def final(study):
+    return importlib.import_module("final")
+
+
+def test_a_release_plays_a_series_of_its_own_from_a_commit(final):
+    one, other = (final.of_release(final.Arguments(), release, "0123456789ab") for release in ("1.0.0", "1.0.1"))
+    assert (one.split, one.episodes, one.out.name) == ("final", 1000, "final-1.0.0.json")
+    assert one.seed != other.seed
+    for commit in (None, "0123456789ab-dirty"):
+        with pytest.raises(SystemExit, match="commit the changes first"):
+            final.of_release(final.Arguments(), "1.0.0", commit)
+    for changed in ({"episodes": 10}, {"out": Path("elsewhere.json")}, {"seed": 1}, {"velocities": (3.0,)}):
+        with pytest.raises(SystemExit, match="what it always plays"):
+            final.of_release(final.Arguments(**changed), "1.0.0", "0123456789ab")
+
+
+def test_a_release_is_opened_once(study, final, tmp_path):
+    arguments = study.Output(out=tmp_path / "final.json")
+    opening = {"release": "1.0.0", "commit": "0123456789ab", "planners": {"corner": "00ff"}, "seed": 7}
+    final.open_release(study.Study(arguments), opening, 2)
+    assert json.loads(arguments.out.read_text())["rows"] == [opening]
+    # A run that was killed goes on.
+    begun = study.Study(arguments)
+    final.open_release(begun, opening, 2)
+    begun.add({"success": 1.0})
+    with pytest.raises(SystemExit, match=r"opened before with other planners or commit, see .*final\.json"):
+        final.open_release(study.Study(arguments), opening | {"planners": {"corner": "00fe"}}, 2)
+    begun.add({"success": 0.5})
+    with pytest.raises(SystemExit, match=r"its figures are in .*final\.json"):
+        final.open_release(study.Study(arguments), opening, 2)
+
+
+def test_no_other_study_plays_the_split_of_releases(study, final):
+    with pytest.raises(InputError, match="split 'final' is played once a release"):
+        study.Episodes(split="final")
+    with pytest.raises(InputError, match="split 'final' is played once a release"):
+        final.main(final.Arguments(split="final", rehearse=True))
 
 
 def test_no_benchmark_is_forgotten():
