@@ -3,15 +3,18 @@
 import importlib
 import importlib.util
 import json
+import shutil
 from pathlib import Path
 
 import pytest
 
+import torchdyn_plan
 from tests.scripts import run
 from torchdyn_plan.errors import InputError
 from torchdyn_plan.tasks import load_task
 
 BENCHMARKS = Path(__file__).parent.parent / "benchmarks"
+WEIGHTS = Path(torchdyn_plan.__file__).parent / "weights"
 SMALL = {
     "ablation": "--velocities 5 --episodes 2 --num-envs 2 --split dev",
     "braking": "--episodes 2 --num-envs 2 --threads 1",
@@ -53,9 +56,10 @@ ELSEWHERE = {
     "sensor_curves",
     "policy_peers",
     "same_episodes",
+    "trainings",
 }
 """Minutes at the least, files of other packages, a picture of trainings, what the package's own arrival map is made by,
-a browser, or a comparison of files."""
+a browser, a comparison of files, or networks of several trainings, which have a test of their own."""
 PARTS = {"arms", "former_latency_side", "sides", "study"}
 """No scripts of their own."""
 
@@ -244,6 +248,40 @@ def test_no_other_study_plays_the_split_of_releases(study, final):
         study.Episodes(split="final")
     with pytest.raises(InputError, match="split 'final' is played once a release"):
         final.main(final.Arguments(split="final", rehearse=True))
+
+
+@pytest.mark.slow
+def test_trainings_are_put_together(study, tmp_path):
+    trainings = importlib.import_module("trainings")
+    shipped = {"forecaster": "forecaster-trapper", "spread": "spread-trapper", "eta": "eta-trapper-ik"}
+    folders = tmp_path / "0", tmp_path / "1"
+    for folder in folders:
+        folder.mkdir()
+        for kind, name in shipped.items():
+            shutil.copy(WEIGHTS / f"{name}.safetensors", folder / f"{kind}.safetensors")
+    arguments = trainings.Arguments(
+        weights=folders, velocities=(1.0, 5.0), episodes=2, num_envs=2, threads=1, out=tmp_path / "figures.json"
+    )
+    trainings.main(arguments)
+    written = json.loads(arguments.out.read_text())["rows"]
+    trainings.main(arguments)
+    assert json.loads(arguments.out.read_text())["rows"] == written
+    *rows, slow, fast, whole = written
+    assert [(row["weights"], row["velocity"]) for row in rows] == [
+        (str(folder), velocity) for folder in folders for velocity in (1.0, 5.0)
+    ]
+    assert slow["interquartile_mean"] == rows[0]["success_solvable"]
+    assert fast["interquartile_mean"] == rows[1]["success_solvable"]
+    assert whole["trainings"] == 2
+    assert whole["interquartile_mean"] == pytest.approx((slow["interquartile_mean"] + fast["interquartile_mean"]) / 2)
+
+
+def test_the_mean_over_trainings_leaves_out_a_failed_one(study):
+    trainings = importlib.import_module("trainings")
+    rows = [[{"success_solvable": value}] for value in (0.9, 0.91, 0.92, 0.1)]
+    found = trainings.over_trainings(rows)
+    assert found["interquartile_mean"] == pytest.approx(0.905)
+    assert found["trainings"] == 4
 
 
 def test_no_benchmark_is_forgotten():
