@@ -20,8 +20,9 @@ import torch
 from tqdm import tqdm
 
 from torchdyn_plan.evaluation.episodes import find_truth, run_episodes
-from torchdyn_plan.evaluation.intervals import paired_loss, rate
+from torchdyn_plan.evaluation.intervals import mcnemar, paired_loss, rate
 from torchdyn_plan.evaluation.results import EpisodeOutcomes
+from torchdyn_plan.evaluation.study import check_open
 from torchdyn_plan.files import write_json
 from torchdyn_plan.tasks import Task, Truth
 from torchdyn_plan.threads import one_thread
@@ -59,6 +60,10 @@ class Episodes(Output):
     """Episodes side by side; does not change the figures."""
     threads: int = 0
     """Threads of the simulation, 0 for all cores; does not change the figures."""
+
+    def __post_init__(self) -> None:
+        """Raise `InputError` for a split that is not for studies."""
+        check_open(self.split)
 
 
 class Study:
@@ -176,9 +181,10 @@ def rate_entries(name: str, successes: int, trials: int) -> Row:
 
 
 def change_entries(before: Row, after: Row) -> Row:
-    """Change of success from one row to another of the same episodes, both as of `success_of`, with its 95 % interval.
+    """Change of success from one row to another of the same episodes, both as of `success_of`.
 
-    The episodes are paired, and only solvable ones count.
+    The episodes are paired, and only solvable ones count: the mean difference with its 95 % interval, and the p-value
+    of McNemar's exact test that there is none.
     """
     missed = sorted({*before["lost"], *after["lost"]})
     rest = torch.ones(after["solvable"] - len(missed), dtype=torch.bool)
@@ -186,8 +192,9 @@ def change_entries(before: Row, after: Row) -> Row:
     def success(row: Row) -> torch.Tensor:
         return torch.cat([torch.tensor([episode not in row["lost"] for episode in missed], dtype=torch.bool), rest])
 
-    gain = paired_loss(success(after), success(before))
-    return {"change": gain.value, "change_ci": [gain.low, gain.high]}
+    pair = success(after), success(before)
+    gain = paired_loss(*pair)
+    return {"change": gain.value, "change_ci": [gain.low, gain.high], "change_p": mcnemar(*pair)}
 
 
 def each(cases: Iterable[Any], what: str) -> Iterator[Any]:

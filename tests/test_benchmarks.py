@@ -3,14 +3,18 @@
 import importlib
 import importlib.util
 import json
+import shutil
 from pathlib import Path
 
 import pytest
 
+import torchdyn_plan
 from tests.scripts import run
+from torchdyn_plan.errors import InputError
 from torchdyn_plan.tasks import load_task
 
 BENCHMARKS = Path(__file__).parent.parent / "benchmarks"
+WEIGHTS = Path(torchdyn_plan.__file__).parent / "weights"
 SMALL = {
     "ablation": "--velocities 5 --episodes 2 --num-envs 2 --split dev",
     "braking": "--episodes 2 --num-envs 2 --threads 1",
@@ -22,6 +26,7 @@ SMALL = {
     "ceiling": "--velocities 5 --episodes 3 --spacing 60 --meetings 1 --leads 7 --rows 64 --split dev",
     "count_calls": "--planners corner --batch 2",
     "diagnose": "--velocities 3 --episodes 4 --arrivals network --split dev",
+    "final": "--rehearse --velocities 5 --planners untrained --episodes 2 --num-envs 2",
     "following": "--arms ur5 --paths 2 --steps 6",
     "forecast_gain": "--episodes 2 --seeds 0 --velocity 5",
     "former_latency": "--former . --planners corner --statics ik --processes 1 --rounds 1 --seconds 0.01 --calls plan",
@@ -53,9 +58,11 @@ ELSEWHERE = {
     "sensor_curves",
     "policy_peers",
     "same_episodes",
+    "trainings",
 }
 """Minutes at the least, another environment, files of other packages, a picture of trainings, what the package's own
-arrival map is made by, a browser, or a comparison of files."""
+arrival map is made by, a browser, a comparison of files, or networks of several trainings, which have a test of their
+own."""
 PARTS = {"air_hockey_side", "arms", "former_latency_side", "sides", "study"}
 """No scripts of their own."""
 
@@ -64,6 +71,7 @@ LONG = {
     "ablation",
     "braking",
     "calibration",
+    "final",
     "following",
     "forecast_gain",
     "former_latency",
@@ -199,6 +207,84 @@ def test_changes_are_paired(study):
     low, high = study.change_entries(before, after)["change_ci"]
     assert low < 0.1 < high
     assert study.change_entries(before, before)["change"] == 0.0
+    # One episode lost and two won: 2 (1 + 3) / 2³.
+    assert study.change_entries(before, after)["change_p"] == 1.0
+    many = {"solvable": 100, "lost": list(range(10))}
+    assert study.change_entries(many, many | {"lost": [0]})["change_p"] == pytest.approx(2 / 2**9)
+
+
+@pytest.fixture
+def final(study):
+    return importlib.import_module("final")
+
+
+def test_a_release_plays_a_series_of_its_own_from_a_commit(final):
+    one, other = (final.of_release(final.Arguments(), release, "0123456789ab") for release in ("1.0.0", "1.0.1"))
+    assert (one.split, one.episodes, one.out.name) == ("final", 1000, "final-1.0.0.json")
+    assert one.seed != other.seed
+    for commit in (None, "0123456789ab-dirty"):
+        with pytest.raises(SystemExit, match="commit the changes first"):
+            final.of_release(final.Arguments(), "1.0.0", commit)
+    for changed in ({"episodes": 10}, {"out": Path("elsewhere.json")}, {"seed": 1}, {"velocities": (3.0,)}):
+        with pytest.raises(SystemExit, match="what it always plays"):
+            final.of_release(final.Arguments(**changed), "1.0.0", "0123456789ab")
+
+
+def test_a_release_is_opened_once(study, final, tmp_path):
+    arguments = study.Output(out=tmp_path / "final.json")
+    opening = {"release": "1.0.0", "commit": "0123456789ab", "planners": {"corner": "00ff"}, "seed": 7}
+    final.open_release(study.Study(arguments), opening, 2)
+    assert json.loads(arguments.out.read_text())["rows"] == [opening]
+    # A run that was killed goes on.
+    begun = study.Study(arguments)
+    final.open_release(begun, opening, 2)
+    begun.add({"success": 1.0})
+    with pytest.raises(SystemExit, match=r"opened before with other planners or commit, see .*final\.json"):
+        final.open_release(study.Study(arguments), opening | {"planners": {"corner": "00fe"}}, 2)
+    begun.add({"success": 0.5})
+    with pytest.raises(SystemExit, match=r"its figures are in .*final\.json"):
+        final.open_release(study.Study(arguments), opening, 2)
+
+
+def test_no_other_study_plays_the_split_of_releases(study, final):
+    with pytest.raises(InputError, match="split 'final' is played once a release"):
+        study.Episodes(split="final")
+    with pytest.raises(InputError, match="split 'final' is played once a release"):
+        final.main(final.Arguments(split="final", rehearse=True))
+
+
+@pytest.mark.slow
+def test_trainings_are_put_together(study, tmp_path):
+    trainings = importlib.import_module("trainings")
+    shipped = {"forecaster": "forecaster-trapper", "spread": "spread-trapper", "eta": "eta-trapper-ik"}
+    folders = tmp_path / "0", tmp_path / "1"
+    for folder in folders:
+        folder.mkdir()
+        for kind, name in shipped.items():
+            shutil.copy(WEIGHTS / f"{name}.safetensors", folder / f"{kind}.safetensors")
+    arguments = trainings.Arguments(
+        weights=folders, velocities=(1.0, 5.0), episodes=2, num_envs=2, threads=1, out=tmp_path / "figures.json"
+    )
+    trainings.main(arguments)
+    written = json.loads(arguments.out.read_text())["rows"]
+    trainings.main(arguments)
+    assert json.loads(arguments.out.read_text())["rows"] == written
+    *rows, slow, fast, whole = written
+    assert [(row["weights"], row["velocity"]) for row in rows] == [
+        (str(folder), velocity) for folder in folders for velocity in (1.0, 5.0)
+    ]
+    assert slow["interquartile_mean"] == rows[0]["success_solvable"]
+    assert fast["interquartile_mean"] == rows[1]["success_solvable"]
+    assert whole["trainings"] == 2
+    assert whole["interquartile_mean"] == pytest.approx((slow["interquartile_mean"] + fast["interquartile_mean"]) / 2)
+
+
+def test_the_mean_over_trainings_leaves_out_a_failed_one(study):
+    trainings = importlib.import_module("trainings")
+    rows = [[{"success_solvable": value}] for value in (0.9, 0.91, 0.92, 0.1)]
+    found = trainings.over_trainings(rows)
+    assert found["interquartile_mean"] == pytest.approx(0.905)
+    assert found["trainings"] == 4
 
 
 def test_no_benchmark_is_forgotten():

@@ -170,6 +170,7 @@ BAD = [
     (["evaluate", "--task", "fetch_reach", "--planners", "wait_and_drop"], "unknown planner of fetch_reach"),
     (["evaluate", "--task", "fetch_reach", "--velocity", "3"], "velocity must be in [0, 0.2], got 3.0"),
     (["evaluate", "--task", "fetch_reach", "--motion", "zigzag"], "unknown motion 'zigzag'"),
+    (["evaluate", "--split", "final"], "split 'final' is played once a release, by benchmarks/final.py"),
     (["evaluate", "--split", "tets"], "unknown split 'tets' (did you mean 'test'?)"),
     (["evaluate", "--velocity", "-1"], "velocity must be in [0, 20], got -1.0"),
     (["evaluate", "--velocity", "nan"], "velocity must be a finite number, got nan"),

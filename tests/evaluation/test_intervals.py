@@ -6,7 +6,16 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from torchdyn_plan.errors import InputError
-from torchdyn_plan.evaluation.intervals import Z_95, paired_loss, rate, wilson_interval
+from torchdyn_plan.evaluation.intervals import (
+    Z_95,
+    interquartile_mean,
+    interquartile_mean_interval,
+    mcnemar,
+    paired_loss,
+    rate,
+    sign_test,
+    wilson_interval,
+)
 
 
 @pytest.mark.parametrize(
@@ -74,3 +83,69 @@ def test_a_paired_loss_counts_what_one_has_and_the_other_has_not():
     assert math.isnan(paired_loss(before[:0], before[:0]).value)
     with pytest.raises(InputError, match=r"\(100,\) and \(3,\)"):
         paired_loss(before, before[:3])
+
+
+@pytest.mark.parametrize(
+    ("lost", "won", "p"),
+    # scipy.stats.binomtest(lost, lost + won).pvalue, scipy 1.17.1.
+    [(5, 15, 0.041389465332031215), (38, 56, 0.07897554800108206), (0, 0, 1.0), (7, 7, 1.0), (0, 10, 0.001953125)],
+)
+def test_the_exact_test_of_pairs_is_scipy_s(lost, won, p):
+    before = torch.tensor([True] * lost + [False] * won + [True] * 9 + [False] * 4)
+    after = torch.tensor([False] * lost + [True] * won + [True] * 9 + [False] * 4)
+    assert mcnemar(before, after) == pytest.approx(p, rel=1e-12)
+    assert mcnemar(after, before) == mcnemar(before, after)
+
+
+def test_the_exact_test_takes_many_episodes_and_no_nonsense():
+    assert 0.0 < sign_test(4000, 4600) < 1e-9
+    with pytest.raises(InputError, match=r"\(3,\) and \(2,\)"):
+        mcnemar(torch.ones(3, dtype=torch.bool), torch.ones(2, dtype=torch.bool))
+    with pytest.raises(InputError, match="fewer than none, got -1 and 3"):
+        sign_test(-1, 3)
+
+
+FIVE = torch.tensor(
+    [
+        [0.965, 0.931, 0.801],
+        [0.951, 0.902, 0.822],
+        [0.972, 0.944, 0.768],
+        [0.940, 0.915, 0.790],
+        [0.958, 0.921, 0.835],
+    ],
+    dtype=torch.float64,
+)
+"""Success of five trainings in three settings, made up."""
+
+
+def test_interquartile_mean_and_interval_are_rliable_s():
+    # rliable 1.2.0: metrics.aggregate_iqm, and library.get_interval_estimates with 50,000 repetitions.
+    found = interquartile_mean_interval(FIVE)
+    assert found.value == pytest.approx(0.9067777777777778, abs=1e-12)
+    assert (found.low, found.high) == pytest.approx((0.89677778, 0.91466667), abs=4e-4)
+    spread = torch.tensor([[0.0, 1, 2, 3], [4, 5, 6, 7], [8, 9, 10, 20]])
+    assert interquartile_mean_interval(spread) == pytest.approx((5.5, 3.0, 8.0), abs=0.2)
+
+
+def test_interquartile_mean_leaves_out_the_ends_and_takes_a_batch():
+    assert interquartile_mean(torch.tensor([[1.0, 2.0], [3.0, 100.0], [5.0, 6.0]])).item() == 4.0
+    batch = torch.stack([FIVE, FIVE.flip(0) / 2])
+    assert interquartile_mean(batch).tolist() == pytest.approx([0.9067777777777778, 0.4533888888888889])
+
+
+def test_one_training_leaves_nothing_to_resample():
+    found = interquartile_mean_interval(FIVE[:1])
+    assert found.low == found.value == found.high
+
+
+@pytest.mark.parametrize(
+    ("scores", "message"),
+    [
+        (torch.ones(3), r"shape \(R, K\), got \(3,\)"),
+        (torch.ones(0, 3), r"got \(0, 3\)"),
+        (torch.full((2, 2), math.nan), "scores must be finite"),
+    ],
+)
+def test_scores_that_are_none_are_refused(scores, message):
+    with pytest.raises(InputError, match=message):
+        interquartile_mean_interval(scores)

@@ -10,7 +10,9 @@ from torch import Tensor
 
 from torchdyn_plan.checks import check_choice
 
-SPLITS = {"test": 0, "dev": 1, "train": 2}
+FINAL = "final"
+"""The split that a release plays once, and nobody before."""
+SPLITS = {"test": 0, "dev": 1, "train": 2, FINAL: 3}
 """Tuning sees ``dev`` only, networks learn from ``train``, and results are reported on ``test``."""
 
 

@@ -12,6 +12,7 @@ from typing import Any
 from tensordict.nn import TensorDictModuleBase
 
 from torchdyn_plan.checks import check_choice, check_count, check_threads
+from torchdyn_plan.envs.episodes import FINAL
 from torchdyn_plan.envs.sensor import Sensor
 from torchdyn_plan.errors import InputError
 from torchdyn_plan.evaluation.episodes import Planner, find_truth, run_episodes
@@ -51,7 +52,7 @@ class Study:
         check_count("episodes", self.episodes)
         check_count("num_envs", self.num_envs)
         check_threads("num_threads", self.num_threads)
-        check_choice("split", self.split, SPLITS)
+        check_open(self.split)
 
     @classmethod
     def of(
@@ -122,6 +123,13 @@ class Study:
     def weights(self) -> Mapping[str, str | None]:
         """A short digest of each planner, including its networks' weights; None for a function."""
         return {name: planner_digest(planner) for name, planner in self.planners.items()}
+
+
+def check_open(split: str) -> None:
+    """Raise `InputError` unless ``split`` is one of `SPLITS`."""
+    if split == FINAL:
+        raise InputError(f"split {FINAL!r} is played once a release, by benchmarks/final.py alone; use test or dev")
+    check_choice("split", split, SPLITS)
 
 
 def _make(task: Task, names: Sequence[str] | None, static: str, weights: str | Path | None) -> dict[str, Planner]:

@@ -24,6 +24,8 @@ from torchdyn_plan.planners.rows import where_rows
 
 LARGEST = 1e6
 """Measurements farther from the origin [m], or with a larger time stamp [s], are rejected."""
+ONE = torch.ones(())
+"""Adding it to a tensor, times a number as ``alpha``, takes half as long as adding the number."""
 CLOCKS = 1e-4
 """A time stamp may lie this far in the future, because clocks round [s]."""
 
@@ -217,9 +219,10 @@ class Track(ABC):
         if looks and _is_nothing(debug_unwrap(time)):
             return state
         measured = Measurement(time, pos, self.noise**2 if variance is None else variance)
-        if looks and _is_in_order(*map(debug_unwrap, (state.time, time, now))):
+        if looks and _is_in_order(debug_unwrap(state.time), debug_unwrap(time), debug_unwrap(now)):
             expected = self._expect_next(state, measured)
-            if debug_unwrap(self._fit(expected)).all():
+            # The least of what is no number is no number, which is not above zero.
+            if debug_unwrap(self._slack(expected)).min().item() >= 0.0:
                 return self._used(state, expected, time)
             return self._sorted(state, measured, now, self._fit(expected).all(0))
         expected = self._expect(state, measured)
@@ -241,15 +244,19 @@ class Track(ABC):
 
     def _expect_next(self, state: TrackState, measured: Measurement) -> Prediction:
         """`_expect` for the common case that no row's measurement is late: fewer operations, the same result."""
-        passed = measured.time - state.time
+        time, pos, error = measured
+        passed = time - state.time
         mean, covariance = self._ahead(state, passed)
-        innovation = measured.pos.movedim(-1, 0) - mean[0]
-        variance = covariance[0][0] + measured.variance
-        return Prediction(mean, covariance, passed, covariance[0], innovation, variance)
+        own = covariance[0][0]
+        variance = own + error if isinstance(error, Tensor) else torch.add(own, ONE, alpha=error)
+        return Prediction(mean, covariance, passed, covariance[0], pos.movedim(-1, 0) - mean[0], variance)
 
     def _ahead(self, state: TrackState, passed: Tensor) -> tuple[list[Tensor], list[list[Tensor]]]:
         """Mean and covariance ``passed`` (*B,) seconds after the state; ``passed`` is not negative."""
         mean, covariance = _unpacked(state.motion)
+        if self.order == 2:
+            place, velocity = mean
+            return [torch.addcmul(place, passed, velocity), velocity], self._spread(covariance, passed)
         forward = _factors(passed, self.order)
         return [_sum(mean[i:], forward) for i in range(self.order)], self._spread(covariance, passed)
 
@@ -274,6 +281,8 @@ class Track(ABC):
 
     def _spread(self, covariance: list[list[Tensor]], ahead: Tensor) -> list[list[Tensor]]:
         """The covariance ``ahead`` (*B,) seconds later: F P Fᵀ + Q, with F of a chain of n integrators."""
+        if self.order == 2 and not self.forgets:
+            return self._spread_pair(covariance, ahead)
         n, forward = self.order, _factors(ahead, self.order)
         whole = _whole(covariance)
         half = [[_sum([whole[k][j] for k in range(i, n)], forward) for j in range(i, n)] for i in range(n)]
@@ -289,20 +298,43 @@ class Track(ABC):
                 found[i][j - i] = _with_power(found[i][j - i], powers, power, factor)
         return found
 
+    def _spread_pair(self, covariance: list[list[Tensor]], ahead: Tensor) -> list[list[Tensor]]:
+        """`_spread` of position and velocity, of which nothing is forgotten: polynomials in t by Horner's rule."""
+        (place, both), (speed,) = covariance
+        q = self.wander
+        # P00 + 2 P01 t + P11 t² + q t³/3, P01 + P11 t + q t²/2 and P11 + q t.
+        third = half = speed
+        if q:
+            third, half = torch.add(speed, ahead, alpha=q / 3.0), torch.add(speed, ahead, alpha=q / 2.0)
+            speed = torch.add(speed, ahead, alpha=q)
+        place = torch.addcmul(place, ahead, torch.addcmul(both, ahead, third, value=0.5), value=2.0)
+        return [[place, torch.addcmul(both, ahead, half)], [speed]]
+
+    def _slack(self, expected: Prediction) -> Tensor:
+        """By how much a measurement is where it was expected, along each axis ``(D, *B)``; negative if it is not."""
+        return torch.addcmul(expected.variance, expected.innovation, expected.innovation, value=-1.0 / self.gate**2)
+
     def _fit(self, expected: Prediction) -> Tensor:
         """``(D, *B)`` bool: whether the measurement is within the gate, along each axis."""
-        return expected.innovation.square() <= self.gate**2 * expected.variance
+        return self._slack(expected) >= 0.0
 
     def _used(self, state: TrackState, expected: Prediction, newest: Tensor) -> TrackState:
         """The Kalman filter's update, for measurements that fit in all rows; the state is at ``newest`` (*B,) [s]."""
-        lever, n = expected.lever, self.order
-        gain = [entry / expected.variance for entry in lever]
-        mean = [torch.addcmul(expected.mean[i], gain[i], expected.innovation) for i in range(n)]
-        covariance = [
-            [torch.addcmul(entry, gain[i], lever[i + k], value=-1.0) for k, entry in enumerate(row)]
-            for i, row in enumerate(expected.covariance)
-        ]
-        return state._replace(motion=_packed(mean, covariance), time=newest, used=state.used + 1)
+        mean, covariance, _, lever, innovation, variance = expected
+        gain = [entry / variance for entry in lever]
+        if self.order == 2:
+            # Most measurements come this way: loops would take as long as two operations.
+            (place, velocity), ((own, both), (rate,)), (first, second), (a, b) = mean, covariance, lever, gain
+            place, velocity = torch.addcmul(place, a, innovation), torch.addcmul(velocity, b, innovation)
+            own, both = torch.addcmul(own, a, first, value=-1.0), torch.addcmul(both, a, second, value=-1.0)
+            parts = [place, velocity, own, both, torch.addcmul(rate, b, second, value=-1.0)]
+        else:
+            parts = [torch.addcmul(entry, factor, innovation) for entry, factor in zip(mean, gain, strict=True)]
+            for i, row in enumerate(covariance):
+                parts += [torch.addcmul(entry, gain[i], lever[i + k], value=-1.0) for k, entry in enumerate(row)]
+        _, _, begin, since, before, used, restarts, rejected = state
+        motion = torch.cat(parts).movedim(0, -1)
+        return TrackState(motion, newest, begin, since, before, used + 1, restarts, rejected)
 
     def _sorted(self, state: TrackState, measured: Measurement, now: Tensor, fits: Tensor) -> TrackState:
         """`add` where rows differ: in some the motion restarts, in others the measurement is missing or rejected."""
@@ -473,7 +505,11 @@ def _is_in_order(before: Tensor, time: Tensor, now: Tensor) -> bool:
 
 
 SIZES = {d * n + n * (n + 1) // 2: (d, n) for d in POINT_SIZES for n in (2, 3)}
-"""Coordinates D and order n by the length of a motion, Dn + n(n+1)/2, which is unique."""
+"""Coordinates D and order n by the numbers of a motion, Dn + n(n+1)/2: no two have as many."""
+PARTS = {size: [d] * n + [1] * (n * (n + 1) // 2) for size, (d, n) in SIZES.items()}
+"""Sizes of a motion's parts: its mean, and the entries of its covariance."""
+ROWS = {2: (slice(2, 4), slice(4, 5)), 3: (slice(3, 6), slice(6, 8), slice(8, 9))}
+"""Which of the parts are the rows of the covariance's upper triangle, by order n."""
 
 
 def _sizes(motion: Tensor) -> tuple[int, int]:
@@ -483,13 +519,10 @@ def _sizes(motion: Tensor) -> tuple[int, int]:
 
 def _unpacked(motion: Tensor) -> tuple[list[Tensor], list[list[Tensor]]]:
     """Mean, n of ``(D, *B)``, and the rows of the covariance's upper triangle, ``(1, *B)`` each."""
-    coordinates, n = _sizes(motion)
-    parts = list(motion.movedim(-1, 0).split([coordinates] * n + [1] * (n * (n + 1) // 2)))
-    mean, rest, rows = parts[:n], parts[n:], []
-    for i in range(n):
-        rows.append(rest[: n - i])
-        rest = rest[n - i :]
-    return mean, rows
+    size = motion.shape[-1]
+    _, n = SIZES[size]
+    parts = list(motion.movedim(-1, 0).split_with_sizes(PARTS[size]))
+    return parts[:n], [parts[row] for row in ROWS[n]]
 
 
 def _packed(mean: list[Tensor], covariance: list[list[Tensor]]) -> Tensor:
