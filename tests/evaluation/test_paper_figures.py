@@ -82,13 +82,13 @@ def test_more_series_count_more(results, drawn, tmp_path):
     content = json.loads((other / "results.json").read_text())
     for row in content["rows"]:
         row |= {"success": 0.0, "repeats": 1, "success_repeats": None, "success_solvable_repeats": None}
-    content["rows"].append(content["rows"][0] | {"planner": "corner", "settings": {"velocity": 0.5, "friction": 0.0}})
+    content["rows"].append(content["rows"][0] | {"planner": "corner", "settings": {"velocity": 5.5, "friction": 0.0}})
     (other / "results.json").write_text(json.dumps(content))
     draw_report(tmp_path / "out", results=results, tasks=[TRAPPER])
     points = line_of(drawn, "figure4", "corner", solvable=False).points
-    assert [point.x for point in points] == [0.5, 1.0, 2.0, 3.0, 4.0, 5.0]
-    assert (points[0].mean, points[0].deviation, points[0].repeats) == (0.0, None, 1)
-    assert all(point.mean > 0.1 and point.repeats == 10 for point in points[1:])
+    assert [point.x for point in points] == [*(0.25 * number for number in range(21)), 5.5]
+    assert (points[-1].mean, points[-1].deviation, points[-1].repeats) == (0.0, None, 1)
+    assert all(point.mean > 0.1 and point.repeats == 10 for point in points[:-1])
 
 
 @pytest.mark.parametrize(

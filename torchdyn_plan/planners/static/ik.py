@@ -311,7 +311,9 @@ class IKPlanner(Precise, StaticPlannerModule):
     def _step_from(self, joint_pos: Tensor, goal: Tensor, pose: Tensor, jacobian: Tensor) -> tuple[Tensor, Tensor]:
         """`step` for known pose and Jacobian of the tool."""
         error = torch.stack(self.approach.twist(pose.flatten(-2).unbind(-1), goal.unbind(-1)), dim=-1)
-        rows = self._rows(pose, jacobian, error.shape[-1])
+        rows = jacobian if error.shape[-1] == 6 else jacobian[..., : error.shape[-1], :]
+        if self._round:
+            rows = self._rows(pose, jacobian, error.shape[-1])
         limit, bounds = cast(Tensor, self._buffers["_limit"]), cast(dict[str, Tensor], self.arm._buffers)
         low, high = bounds["lower"] - joint_pos, bounds["upper"] - joint_pos
         whole = dls_step(rows, error, self.damping)
