@@ -234,7 +234,10 @@ BAD = [
     (["collect", "arrivals", "--static", "kuka", "--out", "{out}"], "unknown static planner of trapper 'kuka'"),
     (["collect", "arrivals", "--weights", "{new}", "--out", "{out}"], "no weights '{new}'"),
     (["collect", "arrivals", "--planner", "nowhere:make", "--out", "{new}"], "no planner at 'nowhere:make'"),
-    (["collect", "arrivals", "--planner", "math:pi", "--out", "{new}"], "a planner takes and returns a tensordict, but 'math:pi' is float"),
+    (
+        ["collect", "arrivals", "--planner", "math:pi", "--out", "{new}"],
+        "a planner takes and returns a tensordict, but 'math:pi' is float",
+    ),
     (["collect", "paths", "--planner", "math:cos", "--out", "{new}"], "--planner is of arrivals, not of paths"),
     (["train", "dher"], "unknown network of trapper 'dher'; choose from eta, forecaster, nearest_eta, noisy_"),
     (["train", "eta", "--static", "kuka", "--out", "{new}"], "unknown static planner of trapper 'kuka'"),
