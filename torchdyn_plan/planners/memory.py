@@ -138,7 +138,7 @@ def remember(tensordict: TensorDictBase, entries: Mapping[str, Tensor]) -> None:
     stored = tensordict.get(keys.PLAN, None)
     # A plain dictionary: to look at a tensordict takes as long as a small operation.
     whole = {} if stored is None else dict(stored.items())
-    if 2 * len(entries) < len(whole):
+    if stored is not None and 2 * len(entries) < len(whole):
         # Each entry of a new tensordict is checked, which takes longer than to leave some out of one that is there.
         fresh = stored.exclude(*entries)
         for name, value in entries.items():

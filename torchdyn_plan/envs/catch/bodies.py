@@ -11,6 +11,7 @@ import mujoco
 import numpy as np
 
 from torchdyn_plan.envs.catch.ur10 import UR10_LINKS, UR10Link
+from torchdyn_plan.envs.servo_arm import add_hinge, add_servos, add_sky
 
 if TYPE_CHECKING:
     from torchdyn_plan.envs.catch.scene import CatchScene
@@ -19,8 +20,6 @@ FLOOR, CUP, BALL = 1, 2, 4
 """Kinds of things that can touch one another: the ball touches the others, and nothing else touches anything."""
 SILVER, BLUE, GREY = (0.73, 0.75, 0.77, 1.0), (0.33, 0.53, 0.70, 1.0), (0.45, 0.47, 0.50, 1.0)
 FELT, FOAM = (0.75, 0.85, 0.10, 1.0), (0.84, 0.38, 0.12, 0.45)
-ARMATURE = 0.1
-"""Inertia of a motor behind its gear [kg·m²]."""
 STAVES = 16
 """Boxes of which the cup's wall is made."""
 TOOL = "tool"
@@ -28,11 +27,7 @@ TOOL = "tool"
 
 def add_look(spec: mujoco.MjSpec) -> None:
     """Sky, floor and light."""
-    sky = spec.add_texture(name="sky", type=mujoco.mjtTexture.mjTEXTURE_SKYBOX, width=256, height=256)
-    sky.builtin, sky.rgb1, sky.rgb2 = mujoco.mjtBuiltin.mjBUILTIN_GRADIENT, [0.90, 0.92, 0.94], [0.62, 0.66, 0.70]
-    visual = spec.visual
-    visual.global_.offwidth, visual.global_.offheight = 1280, 960
-    visual.headlight.ambient, visual.headlight.diffuse = [0.4] * 3, [0.35] * 3
+    add_sky(spec)
     sun: dict[str, Any] = {"type": mujoco.mjtLightType.mjLIGHT_DIRECTIONAL, "castshadow": True}
     spec.worldbody.add_light(pos=[1.5, -1.0, 4.0], dir=[-0.2, 0.15, -1], diffuse=[0.55] * 3, **sun)
     chequered = {"type": mujoco.mjtTexture.mjTEXTURE_2D, "builtin": mujoco.mjtBuiltin.mjBUILTIN_CHECKER}
@@ -64,10 +59,7 @@ def add_ball(spec: mujoco.MjSpec, scene: CatchScene, drag: float) -> None:
 
 
 def add_ur10(spec: mujoco.MjSpec, scene: CatchScene) -> None:
-    """Six bodies whose joint frames are those of `UR10_LINKS`, with capsules for looks, and the cup.
-
-    A servo is two actuators: one pulls to a position that runs on with the speed that is told, one to that speed.
-    """
+    """Six bodies whose joint frames are those of `UR10_LINKS`, with capsules for looks, and the cup."""
     look = {"contype": 0, "conaffinity": 0, "mass": 0.0}
     half = 0.5 * scene.base_height
     stand = {"size": [0.11, half, 0], "pos": [0, 0, half], "rgba": GREY}
@@ -75,30 +67,15 @@ def add_ur10(spec: mujoco.MjSpec, scene: CatchScene) -> None:
     parent, offset = spec.worldbody.add_body(name="base", pos=[0, 0, scene.base_height]), np.eye(4)
     for number, link in enumerate(UR10_LINKS, 1):
         body = parent.add_body(name=f"link{number}", pos=offset[:3, 3], quat=_quaternion(offset), gravcomp=1.0)
-        body.add_joint(
-            name=f"joint{number}",
-            type=mujoco.mjtJoint.mjJNT_HINGE,
-            axis=[0, 0, 1],
-            range=link.range,
-            limited=True,
-            armature=ARMATURE,
-            actfrclimited=True,
-            actfrcrange=[-link.torque, link.torque],
-            actgravcomp=True,
-        )
+        add_hinge(body, f"joint{number}", link)
         offset = link.transform.numpy()
         _add_inertia(body, link, offset)
         for start, end, radius, colour in _SHELLS[number - 1]:
             shape = mujoco.mjtGeom.mjGEOM_CAPSULE
             body.add_geom(type=shape, size=[radius, 0, 0], fromto=[*start, *end], rgba=colour, **look)
         parent = body
-    for number, (stiffness, damping) in enumerate(zip(scene.stiffness, scene.damping, strict=True), 1):
-        joint, low, high = f"joint{number}", *UR10_LINKS[number - 1].range
-        place = spec.add_actuator(name=f"place{number}", target=joint, trntype=mujoco.mjtTrn.mjTRN_JOINT)
-        place.set_to_intvelocity(kp=stiffness)
-        place.actrange, place.actlimited = [low, high], True
-        speed = spec.add_actuator(name=f"speed{number}", target=joint, trntype=mujoco.mjtTrn.mjTRN_JOINT)
-        speed.set_to_velocity(kv=damping)
+    joints = {f"joint{number}": link for number, link in enumerate(UR10_LINKS, 1)}
+    add_servos(spec, joints, stiffness=scene.stiffness, damping=scene.damping)
     mouth = offset.copy()
     mouth[:3, 3] += scene.tool_length * mouth[:3, 2]
     _add_cup(parent.add_body(name=TOOL, pos=mouth[:3, 3], quat=_quaternion(mouth), gravcomp=1.0), scene)

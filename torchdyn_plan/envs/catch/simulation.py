@@ -8,6 +8,7 @@ from torch import Tensor
 
 from torchdyn_plan.envs.catch.scene import GRAVITY, CatchScene
 from torchdyn_plan.envs.catch.ur10 import UR10_LINKS
+from torchdyn_plan.envs.servo_arm import ServoArms
 from torchdyn_plan.kinematics.flight import braked
 
 
@@ -27,22 +28,15 @@ class CatchSimulation:
         self.batch = Batch(self.model, num_envs, num_threads, True)
         self.substeps = round(scene.control_step / scene.substep)
         bound = {name: torch.from_numpy(self.batch.bind(name)) for name in ("qpos", "qvel", "act", "ctrl")}
-        self.qpos, qvel, self._place = bound["qpos"], bound["qvel"], bound["act"]
-        count = len(UR10_LINKS)
-        self._ctrl = bound["ctrl"].view(num_envs, count, 2)
-        self.joint_pos, self.joint_vel = self.qpos[:, :count], qvel[:, :count]
+        self.qpos, qvel, count = bound["qpos"], bound["qvel"], len(UR10_LINKS)
+        self._arms = arms = ServoArms(bound, UR10_LINKS, home=scene.home, control_step=scene.control_step)
+        self.joint_pos, self.joint_vel, self.told_speed = arms.joint_pos, arms.joint_vel, arms.told_speed
         self.ball_pos, self.ball_vel = self.qpos[:, count : count + 3], qvel[:, count : count + 3]
-        self._home = torch.tensor(scene.home, dtype=torch.float64)
-        self.told_speed = torch.zeros(num_envs, count, dtype=torch.float64)
-        self._fastest, self._quickest, self._low, self._high = torch.tensor(
-            [(link.speed, link.acceleration, *link.range) for link in UR10_LINKS], dtype=torch.float64
-        ).unbind(-1)
 
     def reset(self, rows: Tensor, place: Tensor, velocity: Tensor) -> None:
         """Put ``rows`` (M,) back: arms at home, balls at ``place`` (M, 3) [m] with ``velocity`` (M, 3) [m/s]."""
         self.batch.reset(rows.numpy())
-        self.joint_pos[rows], self._place[rows], self.told_speed[rows] = self._home, self._home, 0.0
-        self._ctrl[rows] = 0.0
+        self._arms.reset(rows)
         self.ball_pos[rows] = place
         # MuJoCo moves a ball with the velocity of a substep's end: with this one it is on its parabola after each.
         falls = braked(velocity, velocity.new_tensor(GRAVITY), self.drag)
@@ -50,13 +44,7 @@ class CatchSimulation:
 
     def step(self, action: Tensor) -> None:
         """One control step; ``action`` (N, 6) is joint speed over its limit, -1 to 1."""
-        wanted = action.to(torch.float64).clamp(-1.0, 1.0) * self._fastest
-        # No joint is told a speed that takes it out of its range.
-        time = self.scene.control_step
-        wanted = wanted.clamp((self._low - self.joint_pos) / time, (self._high - self.joint_pos) / time)
-        change = self._quickest * time
-        torch.clamp(wanted, self.told_speed - change, self.told_speed + change, out=self.told_speed)
-        self._ctrl[:] = self.told_speed.unsqueeze(-1)
+        self._arms.command(action)
         self.batch.step(None, nstep=self.substeps)
 
     def place_balls(self, place: Tensor) -> None:

@@ -11,6 +11,7 @@ import mujoco
 import numpy as np
 
 from torchdyn_plan.envs.conveyor.panda import PANDA_FLANGE, PANDA_LINKS, TOOL_TURN
+from torchdyn_plan.envs.servo_arm import add_hinge, add_servos, add_sky
 
 if TYPE_CHECKING:
     from torchdyn_plan.envs.conveyor.scene import ConveyorScene
@@ -21,18 +22,12 @@ BELT, PART = 1, 2
 """Collision groups."""
 WHITE, GREY, DARK = (0.93, 0.93, 0.94, 1.0), (0.55, 0.57, 0.60, 1.0), (0.18, 0.19, 0.21, 1.0)
 COLOURS = ((0.84, 0.38, 0.12, 1.0), (0.12, 0.47, 0.71, 1.0), (0.20, 0.60, 0.30, 1.0), (0.75, 0.60, 0.10, 1.0))
-ARMATURE = 0.1
-"""Inertia of a motor, reflected through its gear [kg·m²]."""
 TOOL = "tool"
 
 
 def add_look(spec: mujoco.MjSpec) -> None:
     """Sky, floor and light."""
-    sky = spec.add_texture(name="sky", type=mujoco.mjtTexture.mjTEXTURE_SKYBOX, width=256, height=256)
-    sky.builtin, sky.rgb1, sky.rgb2 = mujoco.mjtBuiltin.mjBUILTIN_GRADIENT, [0.90, 0.92, 0.94], [0.62, 0.66, 0.70]
-    visual = spec.visual
-    visual.global_.offwidth, visual.global_.offheight = 1280, 960
-    visual.headlight.ambient, visual.headlight.diffuse = [0.4] * 3, [0.35] * 3
+    add_sky(spec)
     spec.worldbody.add_light(
         pos=[0.8, -0.4, 2.5],
         dir=[-0.2, 0.15, -1],
@@ -95,10 +90,7 @@ def add_parts(spec: mujoco.MjSpec, scene: ConveyorScene, count: int) -> None:
 
 
 def add_panda(spec: mujoco.MjSpec, scene: ConveyorScene) -> None:
-    """Seven bodies with the joint frames of `PANDA_LINKS`, visual capsules, and the tool.
-
-    A servo is two actuators: a position servo whose target moves at the commanded speed, and a speed servo.
-    """
+    """Seven bodies with the joint frames of `PANDA_LINKS`, visual capsules, and the tool."""
     capsule, cylinder = mujoco.mjtGeom.mjGEOM_CAPSULE, mujoco.mjtGeom.mjGEOM_CYLINDER
     look = {"contype": 0, "conaffinity": 0, "mass": 0.0}
     parent = spec.worldbody
@@ -107,29 +99,14 @@ def add_panda(spec: mujoco.MjSpec, scene: ConveyorScene) -> None:
         offset = link.offset.numpy()
         turn = [math.cos(link.alpha / 2), math.sin(link.alpha / 2), 0.0, 0.0]
         body = parent.add_body(name=f"link{number}", pos=offset[:3, 3], quat=turn, gravcomp=1.0)
-        body.add_joint(
-            name=f"panda_joint{number}",
-            type=mujoco.mjtJoint.mjJNT_HINGE,
-            axis=[0, 0, 1],
-            range=link.range,
-            limited=True,
-            armature=ARMATURE,
-            actfrclimited=True,
-            actfrcrange=[-link.torque, link.torque],
-            actgravcomp=True,
-        )
+        add_hinge(body, f"panda_joint{number}", link)
         body.mass, body.ipos, body.explicitinertial = link.mass, [0, 0, 0], True
         body.inertia = [0.004 * link.mass] * 3
         for start, end, radius, colour in _SHELLS[number - 1]:
             body.add_geom(type=capsule, size=[radius, 0, 0], fromto=[*start, *end], rgba=colour, **look)
         parent = body
-    for number, (stiffness, damping) in enumerate(zip(scene.stiffness, scene.damping, strict=True), 1):
-        joint, low, high = f"panda_joint{number}", *PANDA_LINKS[number - 1].range
-        place = spec.add_actuator(name=f"place{number}", target=joint, trntype=mujoco.mjtTrn.mjTRN_JOINT)
-        place.set_to_intvelocity(kp=stiffness)
-        place.actrange, place.actlimited = [low, high], True
-        speed = spec.add_actuator(name=f"speed{number}", target=joint, trntype=mujoco.mjtTrn.mjTRN_JOINT)
-        speed.set_to_velocity(kv=damping)
+    joints = {f"panda_joint{number}": link for number, link in enumerate(PANDA_LINKS, 1)}
+    add_servos(spec, joints, stiffness=scene.stiffness, damping=scene.damping)
     half = TOOL_TURN / 2
     tool = parent.add_body(
         name=TOOL,

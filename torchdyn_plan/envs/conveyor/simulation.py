@@ -8,6 +8,7 @@ from torch import Tensor
 
 from torchdyn_plan.envs.conveyor.panda import PANDA_LINKS
 from torchdyn_plan.envs.conveyor.scene import ConveyorScene
+from torchdyn_plan.envs.servo_arm import ServoArms
 from torchdyn_plan.kinematics.quaternions import matrix_quat, quat_multiply
 
 PARKED = (-0.7, 0.25)
@@ -30,25 +31,18 @@ class ConveyorSimulation:
         self.batch = Batch(self.model, num_envs, num_threads, True)
         self.substeps = round(scene.control_step / scene.substep)
         bound = {name: torch.from_numpy(self.batch.bind(name)) for name in ("qpos", "qvel", "act", "ctrl", "eq_active")}
-        self.qpos, qvel, self._place = bound["qpos"], bound["qvel"], bound["act"]
-        self._ctrl, self._active = bound["ctrl"].view(num_envs, -1, 2), bound["eq_active"]
-        self._welds = torch.from_numpy(self.batch.expand("eq_data"))
-        count = len(PANDA_LINKS)
-        self.joint_pos, self.joint_vel = self.qpos[:, :count], qvel[:, :count]
+        self.qpos, qvel, count = bound["qpos"], bound["qvel"], len(PANDA_LINKS)
+        self._active, self._welds = bound["eq_active"], torch.from_numpy(self.batch.expand("eq_data"))
+        self._arms = arms = ServoArms(bound, PANDA_LINKS, home=scene.home, control_step=scene.control_step)
+        self.joint_pos, self.joint_vel, self.told_speed = arms.joint_pos, arms.joint_vel, arms.told_speed
         free, moving = self.qpos[:, count:].view(num_envs, parts, 7), qvel[:, count:].view(num_envs, parts, 6)
         self.part_pos, self.part_quat = free[..., :3], free[..., 3:]
         self.part_vel, self._part_spin = moving[..., :3], moving[..., 3:]
-        self._home = torch.tensor(scene.home, dtype=torch.float64)
-        self.told_speed = torch.zeros(num_envs, count, dtype=torch.float64)
-        self._fastest, self._quickest, self._low, self._high = torch.tensor(
-            [(link.speed, link.acceleration, *link.range) for link in PANDA_LINKS], dtype=torch.float64
-        ).unbind(-1)
 
     def reset(self, rows: Tensor, place: Tensor, yaw: Tensor) -> None:
         """Put ``rows`` (M,) back: arms at home, parts at ``place`` (M, K, 2) [m], turned by ``yaw`` (M, K) [rad]."""
         self.batch.reset(rows.numpy())
-        self.joint_pos[rows], self._place[rows], self.told_speed[rows] = self._home, self._home, 0.0
-        self._ctrl[rows] = 0.0
+        self._arms.reset(rows)
         self.part_pos[rows, :, :2] = place
         self.part_pos[rows, :, 2] = self.scene.top - 0.5 * self.scene.part_size[2]
         zero = torch.zeros_like(yaw)
@@ -59,13 +53,7 @@ class ConveyorSimulation:
 
     def step(self, action: Tensor) -> None:
         """One control step; ``action`` (N, 7) is joint speed over its limit, -1 to 1."""
-        wanted = action.to(torch.float64).clamp(-1.0, 1.0) * self._fastest
-        # No joint is told a speed that takes it out of its range.
-        time = self.scene.control_step
-        wanted = wanted.clamp((self._low - self.joint_pos) / time, (self._high - self.joint_pos) / time)
-        change = self._quickest * time
-        torch.clamp(wanted, self.told_speed - change, self.told_speed + change, out=self.told_speed)
-        self._ctrl[:] = self.told_speed.unsqueeze(-1)
+        self._arms.command(action)
         self.batch.step(None, nstep=self.substeps)
 
     def hold(self, held: Tensor, tool_pos: Tensor, tool_rotation: Tensor) -> None:
