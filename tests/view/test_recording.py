@@ -4,11 +4,12 @@ import numpy as np
 import pytest
 import torch
 
+from torchdyn_plan import keys
 from torchdyn_plan.envs import Sensor
 from torchdyn_plan.errors import InputError
 from torchdyn_plan.evaluation import evaluate
 from torchdyn_plan.planners import Delayed, KalmanTrack, PlanStatus
-from torchdyn_plan.tasks import load_task
+from torchdyn_plan.tasks import load_task, task_names
 from torchdyn_plan.view import Scenario, record_episode
 from torchdyn_plan.view.insight import Watch
 from torchdyn_plan.view.recording import NOTHING
@@ -103,6 +104,30 @@ def test_a_watched_planner_does_what_it_does():
         assert (insight is None) == (not bool(planned["plan", "replanned"]))
         watched.planner(planned)
         seen = step_mdp(env.step(planned))
+
+
+@pytest.mark.parametrize("name", task_names())
+def test_a_planner_of_every_task_can_be_watched(name):
+    from torchrl.envs.utils import step_mdp
+
+    if name.startswith("fetch"):
+        pytest.importorskip("gymnasium_robotics")
+    task = load_task(name)
+    # The last one that does not need the true future.
+    planners = [task.planner(one) for one in task.default_planners]
+    watched = Watch([one for one in planners if keys.TARGET_FUTURE not in one.in_keys][-1])
+    env = task.make_env(task.default_settings(), num_envs=1, seed=0, split="dev", num_threads=1)
+    seen, found = env.reset(), None
+    for step in range(16):
+        planned = watched.planner(seen)
+        found = watched.insight(seen["robot_state"], seen["target_pos"].view(-1, seen["target_pos"].shape[-1]), step)
+        if found is not None:
+            break
+        seen = step_mdp(env.step(planned))
+    if watched.planner is watched._inner:
+        assert found is not None
+        assert not found.slack.isnan().any()
+        assert not found.region_steps.isnan().any()
 
 
 def test_a_delayed_plan_is_of_later():

@@ -65,6 +65,11 @@ class WatchedSearch:
     shown: list[Shown] = field(default_factory=list)
     """Inputs since the list was last read."""
 
+    @property
+    def reads_turn(self) -> bool:
+        """Whether the wrapped search reads how the tool is to be turned."""
+        return getattr(self.search, "reads_turn", False)
+
     def __call__(
         self, forecast: Forecast, target_pos: Tensor, eta: ArrivalQuery, context: SearchContext = NO_CONTEXT
     ) -> Meeting:
@@ -105,23 +110,26 @@ class Watch:
 def look_into(search: Any, shown: Shown, eta: ArrivalQuery, grid: Tensor, *, step: int, delay: int) -> Insight:
     """Insight of the first row, from the inputs ``shown`` to ``search`` at ``step``; times start ``delay`` later."""
     path, now, descent = shown.forecast.path[:1], shown.target_pos[:1], getattr(search, "descent_steps", 0.0)
-    lost_at = shown.context.lost
+    lost_at, turn = shown.context.lost, shown.context.turn
     if hasattr(search, "candidates"):
         found = search.candidates(path, now, lost_at)
         thin = slice(None, None, -(-found.goals.shape[-2] // CANDIDATES))
         goals, target_steps = found.goals[:, thin], found.target_steps.expand(found.goals.shape[:-1])[:, thin]
         lost = None if found.lost is None else found.lost[:, thin]
+        quats = None if turn is None else turn[:1, (found.steps[thin] - 1).clamp_min(0)]
     else:
         stride = -(-path.shape[-2] // CANDIDATES)
         goals, target_steps = path[:, stride - 1 :: stride], torch.arange(stride, path.shape[-2] + 1, stride)[None]
-        lost = None if lost_at is None else lost_at.forecast(goals)
-    slack = target_steps + delay - descent - _steps_to(eta, goals)
+        lost, quats = None if lost_at is None else lost_at.forecast(goals), None
+    slack = target_steps + delay - descent - _steps_to(eta, goals, quats)
     half_width = torch.full_like(path[0, :, :2], torch.nan)
     if shown.forecast.spread is not None:
         half_width = shown.forecast.spread.interval(SHARE)[0]
     places = search.goals(grid) if hasattr(search, "goals") else grid
     # A goal that is moved into reach says nothing about the original position.
     moved = (places - grid)[:, :2].norm(dim=-1) > 1e-6
+    # Zeros for a quaternion leave the tool turned as it is.
+    as_turned = None if turn is None else places.new_zeros(1, len(places), 4)
     return Insight(
         begin=step + delay,
         path=path[0],
@@ -130,11 +138,13 @@ def look_into(search: Any, shown: Shown, eta: ArrivalQuery, grid: Tensor, *, ste
         target_steps=target_steps[0],
         slack=(slack if lost is None else slack.masked_fill(lost, -torch.inf))[0],
         region=places,
-        region_steps=_steps_to(eta, places[None])[0].masked_fill(moved, torch.inf),
+        region_steps=_steps_to(eta, places[None], as_turned)[0].masked_fill(moved, torch.inf),
     )
 
 
-def _steps_to(eta: ArrivalQuery, goals: Tensor) -> Tensor:
-    """Control steps (1, K) to goals (1, K, D), infinite if the robot never arrives."""
+def _steps_to(eta: ArrivalQuery, goals: Tensor, quats: Tensor | None = None) -> Tensor:
+    """Control steps (1, K) to goals (1, K, D), turned by ``quats`` (1, K, 4) if any; infinite for never."""
+    if quats is not None:
+        goals = torch.cat([goals, quats], dim=-1)
     arrival = eta(goals, estimator="expectation")
     return arrival.steps.masked_fill(arrival.never.bool(), torch.inf)
