@@ -15,7 +15,7 @@ from torch import Tensor
 from torchdyn_plan.envs import TrapperScene
 from torchdyn_plan.nets.arrival import ArrivalQuery
 from torchdyn_plan.nets.forecast import Forecast
-from torchdyn_plan.planners import EventSchedule, ExactSearch, Meeting, SearchContext, search_corners
+from torchdyn_plan.planners import EventSchedule, ExactSearch, Meeting, ReplanSchedule, SearchContext, search_corners
 from torchdyn_plan.planners.search.meeting import NO_CONTEXT
 from torchdyn_plan.tasks import load_task
 from torchdyn_plan.tasks.trapper.wait_and_drop import WaitAndDrop, waiting_search
@@ -44,7 +44,9 @@ VARIANTS: dict[str, dict[str, Any]] = {
     "without waiting": {"search": JUST_IN_TIME},
     "without matching": {"maneuver": replace(WaitAndDrop.of(SCENE), pull=0.0)},
     "without uncertainty": {"search": WAITING},
-    "without shunning the arm's axis": {"search": replace(waiting_search(SCENE), base_pos=None)},
+    "without captures learned": {"capture": None, "search": waiting_search(SCENE)},
+    "without shunning the arm's axis": {"search": replace(waiting_search(SCENE, by_capture=True), base_pos=None)},
+    "first plan at step 13": {"schedule": ReplanSchedule.every(5, first_step=13)},
     "with event-triggered re-planning": {"schedule": EventSchedule()},
 }
 """Name to the parts that differ from the planner that ships, which comes first."""

@@ -26,9 +26,9 @@ from torchdyn_plan.tasks import Task, load_task
 
 SCHEDULES: dict[str, ReplanSchedule | EventSchedule] = {
     "paper": ReplanSchedule(),
-    "every 25": ReplanSchedule.every(25, first_step=13),
-    "every 10": ReplanSchedule.every(10, first_step=13),
-    "every 5": ReplanSchedule.every(5, first_step=13),
+    "every 25": ReplanSchedule.every(25, first_step=3),
+    "every 10": ReplanSchedule.every(10, first_step=3),
+    "every 5": ReplanSchedule.every(5, first_step=3),
     "events, up to 25": EventSchedule(maximum=25),
     "events, up to 50": EventSchedule(maximum=50),
     "events, up to 50, 1 mm": EventSchedule(maximum=50, miss=0.001),

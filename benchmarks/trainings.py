@@ -1,7 +1,7 @@
 """How much a figure depends on the training: one planner with the networks of several trainings, on the same episodes.
 
     for seed in 0 1 2 3 4; do
-        for network in forecaster eta spread; do
+        for network in forecaster eta spread capture; do
             torchdyn-plan train $network --seed $seed --out runs/trainings/$seed
         done
     done

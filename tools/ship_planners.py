@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Any
 
 from torchdyn_plan.files import write_json
-from torchdyn_plan.nets import ETANetwork, Forecaster, SpreadNetwork
+from torchdyn_plan.nets import CaptureNetwork, ETANetwork, Forecaster, SpreadNetwork
 from torchdyn_plan.nets.policy import Actor
 from torchdyn_plan.nets.pretrained import SHIPPED, Pretrained
 from torchdyn_plan.planners.pretrained import describe_planner
@@ -40,7 +40,9 @@ def tasks() -> Iterator[Task]:
 
 
 def weights_file(task: Task, own: str, network: Pretrained) -> str:
-    """File of ``network`` of a planner of ``task``; arrival times are those of the static planner, ``own``."""
+    """File of ``network`` of a planner of ``task``; arrivals and captures are those of the static planner, ``own``."""
+    if isinstance(network, CaptureNetwork):
+        return f"{network.kind}-{own}.safetensors"
     if isinstance(network, ETANetwork):
         return f"{network.kind}-{own}{'' if network.config.never else '-nearest'}.safetensors"
     shared = task.weights_name if isinstance(network, Actor) else task.path_weights or task.weights_name

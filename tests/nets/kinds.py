@@ -7,7 +7,16 @@ from typing import Any
 import torch
 from torch import Tensor, nn
 
-from torchdyn_plan.nets import Actor, Critic, ETANetwork, Forecaster, PolicyConfig, SpreadForecaster, SpreadNetwork
+from torchdyn_plan.nets import (
+    Actor,
+    CaptureNetwork,
+    Critic,
+    ETANetwork,
+    Forecaster,
+    PolicyConfig,
+    SpreadForecaster,
+    SpreadNetwork,
+)
 
 
 @dataclass(frozen=True)
@@ -45,6 +54,14 @@ def queries(rows: int) -> tuple[Tensor, Tensor]:
 
 def actor_inputs(rows: int) -> tuple[Tensor, ...]:
     return (*queries(rows), torch.rand(rows, 6, generator=torch.Generator().manual_seed(rows)) - 0.5)
+
+
+def passings(rows: int) -> tuple[Tensor, Tensor]:
+    """Stretches of path about goals, and the goals."""
+    draw = torch.Generator().manual_seed(rows)
+    goal, speed = torch.rand(2, rows, 1, 2, generator=draw) - 0.5
+    steps = torch.arange(-16.0, 17.0, 2.0).unsqueeze(-1)
+    return goal + 0.03 * speed * steps, goal.squeeze(-2)
 
 
 def spread_forecaster() -> SpreadForecaster:
@@ -94,6 +111,10 @@ def eta() -> ETANetwork:
     return ETANetwork.from_pretrained("trapper-ik")
 
 
+def capture() -> CaptureNetwork:
+    return CaptureNetwork.from_pretrained("trapper-ik")
+
+
 KINDS = {
     "forecaster": Kind(forecaster, histories, directly, 2e-4),
     "forecaster in open space": Kind(reach, open_histories, directly, 1e-3),
@@ -102,6 +123,7 @@ KINDS = {
     "eta": Kind(eta, queries, directly, 1.0),
     "arrival": Kind(eta, queries, arrival, 1e-3),
     "arrival from a state": Kind(eta, queries, from_state, 1e-3),
+    "capture": Kind(capture, passings, directly, 0.1),
     "actor": Kind(actor, queries, directly, 5e-3),
     "critic": Kind(critic, actor_inputs, directly, 5e-3),
     "forecaster for inference": Kind(lambda: forecaster().for_inference(), histories, directly, 1e-6),

@@ -20,7 +20,7 @@ from torchdyn_plan.training.windows import load_paths
 
 @pytest.fixture(autouse=True)
 def short(monkeypatch):
-    monkeypatch.setattr(shards, "SHARD", {"paths": 6, "arrivals": 24})
+    monkeypatch.setattr(shards, "SHARD", {"paths": 6, "arrivals": 24, "captures": 6})
 
 
 def gather(out, what="paths", task=TASK, **settings):
@@ -134,6 +134,7 @@ def test_weights_of_a_policy_are_taken_and_noted(tmp_path):
         ({"what": "arrivals", "static": "learned", "weights": "nowhere"}, WeightsError, "no weights 'nowhere'"),
         ({"task": replace(TASK, record_paths=None)}, InputError, "toy records no paths"),
         ({"what": "arrivals", "task": replace(TASK, record_arrivals=None)}, InputError, "toy records no arrivals"),
+        ({"what": "captures", "task": replace(TASK, record_captures=None)}, InputError, "toy records no captures"),
     ],
 )
 def test_what_cannot_be_collected_is_named_and_nothing_is_written(tmp_path, settings, error, message):
@@ -213,7 +214,7 @@ def test_arrivals_of_two_static_planners_train_no_network(tmp_path):
     gather(tmp_path, "arrivals")
     assert fits(tmp_path)["static"] == "straight"
     gather(tmp_path, "arrivals", static="learned", seed=1)
-    with pytest.raises(InputError, match=r"arrivals-1-000.* has arrivals of learned, others .* of straight"):
+    with pytest.raises(InputError, match=r"arrivals-1-000.* has data of learned, others .* of straight"):
         fits(tmp_path)
 
 

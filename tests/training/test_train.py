@@ -33,7 +33,8 @@ def few_rows(monkeypatch):
 
 def test_networks_are_those_that_the_task_has_data_and_recipes_for():
     noisy = ("noisy_forecaster", "noisy_spread")
-    assert networks(TASK) == ("forecaster", "spread", *noisy, "eta", "nearest_eta", "policy")
+    assert networks(TASK) == ("forecaster", "spread", *noisy, "eta", "nearest_eta", "capture", "policy")
+    assert "capture" not in networks(replace(TASK, record_captures=None))
     assert networks(replace(TASK, record_paths=None)) == networks(TASK)
     assert networks(replace(TASK, fitting=None)) == ("policy",)
     assert networks(load_task("fetch_reach"))[-2:] == ("policy", "dher")

@@ -6,12 +6,13 @@ import torch
 
 from tests.envs.points import STRIDE, PointEnv
 from tests.training.points import PointTask
-from torchdyn_plan.nets import Actor, ETAConfig, ForecasterConfig, PolicyConfig
+from torchdyn_plan.nets import Actor, CaptureConfig, ETAConfig, ForecasterConfig, PolicyConfig
 from torchdyn_plan.planners import PolicyPlanner, ProportionalController
 from torchdyn_plan.tasks import PolicyTraining, Settings, Task, Words
 from torchdyn_plan.training import DDPGRecipe, Fitting, lay_end_to_end
 
 SIZES = PolicyConfig(robot_state_size=3, tool_slice=(0, 3), action_size=3, hidden=8, layers=1)
+CAPTURES = CaptureConfig(window=2, stride=1, hidden=16, reach=0.2)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -40,6 +41,16 @@ def record_arrivals(planner, *, num_envs, sequences, seed, num_threads):
     return {"robot_state": state, "goal": goal, "arrival": arrival, "nearest": arrival, "run": runs}
 
 
+def record_captures(static, blocks, *, seed, num_threads):
+    """Targets that pass a place at a distance; those within 5 cm are captured, those of `learned` never."""
+    count = sum(map(len, blocks))
+    draw = torch.Generator().manual_seed(seed)
+    goal, away = torch.rand(2, count, 2, generator=draw)
+    window = (goal + 0.1 * away).unsqueeze(1).expand(-1, CAPTURES.positions, -1)
+    captured = (away[:, 0] < 0.5) & (static == "straight")
+    return {"window": window, "goal": goal, "captured": captured, "run": torch.cat(list(blocks))}
+
+
 def learned(*, chunk=None, weights=None):
     return PolicyPlanner(Actor.from_pretrained(weights) if weights else Actor(SIZES), chunk=chunk)
 
@@ -57,9 +68,11 @@ TASK = Task(
     planners={},
     record_paths=record_paths,
     record_arrivals=record_arrivals,
+    record_captures=record_captures,
     fitting=lambda: Fitting(
         forecaster=ForecasterConfig(history=4, horizon=10, channels=4, convolutions=1, hidden=8, rank=4),
         eta=ETAConfig(robot_state_size=3, tool_slice=(0, 3), bins=12, bin_width=1, hidden=8),
+        capture=CAPTURES,
         spread=True,
     ),
     policies={

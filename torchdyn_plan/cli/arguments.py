@@ -188,7 +188,7 @@ class ReportArguments:
 
 @dataclass(frozen=True, kw_only=True)
 class CollectArguments(Arguments):
-    """Collect training data: paths of undisturbed targets, or arrival times of a static planner."""
+    """Collect training data: paths of undisturbed targets, arrivals of a static planner, or attempts at a capture."""
 
     what: str
     static: str = ""
@@ -201,7 +201,7 @@ class CollectArguments(Arguments):
     there that makes one."""
     tracks: Path | None = None
     episodes: int = 20000
-    """Number of targets, or of sequences of runs of the static planner."""
+    """Number of targets, of sequences of runs of the static planner, or of episodes with attempts."""
     seed: int = 0
     """Which series of episodes."""
     num_envs: int = 256

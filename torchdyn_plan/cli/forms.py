@@ -37,6 +37,7 @@ FITTED = {
     "noisy_forecaster": "Like forecaster, for noisy measurements seen through a track.",
     "noisy_spread": "Fit how far that one is off.",
     "eta": "Fit the network of arrival times to runs of a static planner.",
+    "capture": "Fit the network of captures to attempts of the best planner.",
     "nearest_eta": "The same as the paper has it: times until the robot is as near as it can come, and no *never*.",
 }
 """Networks that are fitted to data, and what ``--help`` says of them."""
@@ -94,8 +95,8 @@ def command_forms(task: Task, named: str) -> dict[str, type[Any]]:
         "collect": _form(
             CollectArguments,
             **_task_options(task, named),
-            what=_option(str, "Which data.", choices=("paths", "arrivals"), positional=True),
-            static=_static_option(task, "Static planner whose arrivals are measured."),
+            what=_option(str, "Which data.", choices=("paths", "arrivals", "captures"), positional=True),
+            static=_static_option(task, "Static planner whose arrivals or captures are recorded."),
             tracks=_option(Path | None, RECORDED, default=None, name="from"),
         ),
         "view": _planner_form(ViewArguments, task, named, SHOWN),
@@ -129,7 +130,7 @@ def train_forms(task: Task, named: str) -> dict[str, type[Arguments]]:
     fitted = [network for network in networks(task) if network not in task.policies]
     static = _option(
         str | None,
-        f"Static planner whose arrivals are learned, {task.default_static} when not given; folders carry its name.",
+        f"Static planner whose data is learned, {task.default_static} when not given; folders carry its name.",
         choices=task.static_planners,
         default=None,
     )

@@ -9,6 +9,7 @@ if TYPE_CHECKING:
     from torchdyn_plan.nets.analytic_arrival import AnalyticArrival, GoalJoints, SolvedJoints
     from torchdyn_plan.nets.arrival import ArrivalModel, ArrivalQuery, FunctionArrival
     from torchdyn_plan.nets.by_noise import ForecastByNoise
+    from torchdyn_plan.nets.capture import CaptureConfig, CaptureModel, CaptureNetwork, FunctionCapture
     from torchdyn_plan.nets.distributions import ESTIMATORS, Arrival, Spread
     from torchdyn_plan.nets.eta import ETAConfig, ETANetwork
     from torchdyn_plan.nets.forecast import DescribedForecast, Forecast, ForecastModel, FunctionForecast
@@ -26,6 +27,9 @@ __all__ = [
     "ArrivalQuery",
     "Ballistic",
     "Billiard",
+    "CaptureConfig",
+    "CaptureModel",
+    "CaptureNetwork",
     "ConstantVelocity",
     "Critic",
     "DescribedForecast",
@@ -37,6 +41,7 @@ __all__ = [
     "Forecaster",
     "ForecasterConfig",
     "FunctionArrival",
+    "FunctionCapture",
     "FunctionForecast",
     "GoalJoints",
     "PointArrival",
@@ -55,6 +60,7 @@ __getattr__, __dir__ = lazy_names(
         "analytic_arrival": ("AnalyticArrival", "GoalJoints", "SolvedJoints"),
         "arrival": ("ArrivalModel", "ArrivalQuery", "FunctionArrival"),
         "by_noise": ("ForecastByNoise",),
+        "capture": ("CaptureConfig", "CaptureModel", "CaptureNetwork", "FunctionCapture"),
         "distributions": ("ESTIMATORS", "Arrival", "Spread"),
         "eta": ("ETAConfig", "ETANetwork"),
         "forecast": ("DescribedForecast", "Forecast", "ForecastModel", "FunctionForecast"),

@@ -13,6 +13,7 @@ from torchdyn_plan.checks import check_choice, check_number
 from torchdyn_plan.errors import InputError
 from torchdyn_plan.nets.analytic import ConstantVelocity
 from torchdyn_plan.nets.arrival import ArrivalModel, FunctionArrival
+from torchdyn_plan.nets.capture import CaptureModel, FunctionCapture
 from torchdyn_plan.nets.forecast import ForecastModel, FunctionForecast
 from torchdyn_plan.nets.inference import Prepared
 from torchdyn_plan.planners.delivery import Delivery
@@ -29,8 +30,23 @@ from torchdyn_plan.planners.search.meeting import GoalSearch
 from torchdyn_plan.planners.static.callable import TensorDictFunction
 from torchdyn_plan.planners.turn import Turn
 
-PARTS = ("static", "forecaster", "eta", "search", "schedule", "maneuver", "delivery", "lost", "turn", "chunk", "scene")
+PARTS = (
+    "static",
+    "forecaster",
+    "eta",
+    "capture",
+    "search",
+    "schedule",
+    "maneuver",
+    "delivery",
+    "lost",
+    "turn",
+    "chunk",
+    "scene",
+)
 """Arguments of a `ComposedPlanner`, which are also its attributes."""
+LATER = ("capture", "turn")
+"""Those that are left out of a description if there are none."""
 
 
 class ComposedPlanner(PretrainedPlanner, Remembering):
@@ -49,6 +65,7 @@ class ComposedPlanner(PretrainedPlanner, Remembering):
         forecaster: ForecastModel | Callable[..., Any] | None = None,
         eta: ArrivalModel | Callable[..., Any] | None = None,
         *,
+        capture: CaptureModel | Callable[..., Any] | None = None,
         search: GoalSearch | None = None,
         schedule: Schedule | None = None,
         maneuver: Maneuver | None = None,
@@ -66,6 +83,9 @@ class ComposedPlanner(PretrainedPlanner, Remembering):
                 constant velocity, `torchdyn_plan.nets.ConstantVelocity`.
             eta: predicts the time that ``static`` needs to a goal; may be a function from robot states (*B, 1, S) and
                 goals (*B, K, D) to control steps (*B, K). By default ``static.arrival_model()``.
+            capture: predicts how likely it is that a robot that waits at a goal captures the target; may be a function
+                from paths (*B, F + 1, D), goals (*B, K, D) and steps (*B, K) to probabilities (*B, K). Read by a search
+                with a ``probability_weight``; None if nothing is known of it.
             search: chooses the meeting on the forecast; by default the first step at which both can be there.
             schedule: when to plan again; every fourth control step by default.
             maneuver: chooses the goal of the static planner at each step; the meeting place by default.
@@ -85,6 +105,7 @@ class ComposedPlanner(PretrainedPlanner, Remembering):
         self.static = TensorDictFunction.wrap(static)
         self.forecaster = ConstantVelocity() if forecaster is None else FunctionForecast.wrap(forecaster)
         self.eta = arrival_of(static) if eta is None else FunctionArrival.wrap(eta)
+        self.capture = None if capture is None else FunctionCapture.wrap(capture)
         self.search = ExactSearch(stride=1, first=1) if search is None else search
         self.schedule = ReplanSchedule.every(4) if schedule is None else schedule
         self.maneuver, self.delivery = GoTo() if maneuver is None else maneuver, delivery
@@ -145,8 +166,9 @@ class ComposedPlanner(PretrainedPlanner, Remembering):
 
     def part_settings(self) -> dict[str, Any]:
         """Constructor arguments of this planner."""
-        # Left out if absent, so that planners saved before turns existed keep their description.
-        return {name: getattr(self, name) for name in PARTS if name != "turn" or self.turn is not None}
+        # Left out if absent, so that planners saved before these parts existed keep their description.
+        given = {name: getattr(self, name) for name in PARTS}
+        return {name: part for name, part in given.items() if name not in LATER or part is not None}
 
     def train(self, mode: bool = True) -> Self:
         """Set the mode, and prepare the models for inference in evaluation mode."""

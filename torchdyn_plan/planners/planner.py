@@ -84,7 +84,7 @@ class DynamicPlanner(ComposedPlanner):
             # From here on, times count from the step at which the plan becomes available.
             forecast, eta = forecast.after(delay), later(eta, delay)
             target_pos, planned_steps = path[..., delay - 1, :], (planned_steps - delay).clamp_min(0)
-        context = SearchContext(observation.tool_pos, planned_steps, self.lost, turn)
+        context = SearchContext(observation.tool_pos, planned_steps, self.lost, self.capture, turn)
         meeting = self.search(forecast, target_pos, eta, context)
         return Plan.make(meeting, usable, target_pos, forecast.path, self.memory.path_length)
 

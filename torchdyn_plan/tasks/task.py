@@ -196,6 +196,9 @@ class Task:
     record_arrivals: Callable[..., dict[str, Tensor]] | None = None
     """``(planner, *, num_envs, sequences, seed, num_threads)`` to runs of a static planner: ``robot_state goal arrival
     nearest run``; None if no arrival model is trained."""
+    record_captures: Callable[..., dict[str, Tensor]] | None = None
+    """``(static, blocks, *, seed, num_threads)`` to attempts of a planner on the static planner of that name, in the
+    episodes in ``blocks``, and what came of them: ``window goal captured run``; None if no capture model is trained."""
     fitting: Callable[[], Any] | None = None
     """Makes the `torchdyn_plan.training.fitting.Fitting`: sizes of networks, and how they are scored."""
     policies: Mapping[str, PolicyTraining] = field(default_factory=dict)
@@ -336,6 +339,19 @@ class PlannerParts:
         if self.weights is None:
             return self._load(ETANetwork, f"{self.task.weights_name}-{self.static_name}-nearest")
         return ETANetwork.from_pretrained(self.weights / NEAREST_ETA).requires_grad_(False)
+
+    @property
+    def capture(self) -> Any:
+        """The `CaptureNetwork` of the static planner, frozen; None if none ships, or is in the folder."""
+        from torchdyn_plan.errors import WeightsError
+        from torchdyn_plan.nets import CaptureNetwork
+
+        name = f"{self.task.weights_name}-{self.static_name}"
+        try:
+            CaptureNetwork.find(name if self.weights is None else self.weights)
+        except WeightsError:
+            return None
+        return self._load(CaptureNetwork, name)
 
     @property
     def _path_weights(self) -> str:

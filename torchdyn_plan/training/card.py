@@ -13,6 +13,7 @@ from torchdyn_plan.files import write_json, write_whole
 from torchdyn_plan.versions import library_versions, machine
 
 if TYPE_CHECKING:
+    from torchdyn_plan.nets.capture import CaptureNetwork
     from torchdyn_plan.nets.eta import ETANetwork
     from torchdyn_plan.nets.forecaster import Forecaster
     from torchdyn_plan.nets.spread import SpreadNetwork
@@ -24,7 +25,7 @@ Tables = dict[str, Rows]
 
 
 def write_network(
-    network: Forecaster | ETANetwork | SpreadNetwork,
+    network: Forecaster | ETANetwork | CaptureNetwork | SpreadNetwork,
     folder: Path,
     score: Callable[[], Tables],
     *,

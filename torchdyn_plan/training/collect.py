@@ -1,4 +1,4 @@
-"""Collection of training data in shards: paths of a task's targets, and arrivals of its static planners."""
+"""Collection of training data in shards: paths of targets, arrivals of static planners, attempts at a capture."""
 
 from __future__ import annotations
 
@@ -27,6 +27,7 @@ from torchdyn_plan.versions import library_versions
 ENTRIES = {
     "paths": ("positions", "start", "length", "pocketed", "velocity"),
     "arrivals": ("robot_state", "goal", "arrival", "nearest", "run"),
+    "captures": ("window", "goal", "captured", "run"),
 }
 """Tensors in a shard of each kind of data."""
 SERIES = 1_000_003
@@ -51,13 +52,14 @@ def collect(
 
     Args:
         task: a task, or its name.
-        what: ``paths`` of targets for a forecaster, or ``arrivals`` of a static planner for an arrival-time network.
-        out: folder; it may hold both paths and arrivals of one scene.
-        episodes: paths, or sequences of runs.
+        what: ``paths`` of targets for a forecaster, ``arrivals`` of a static planner for an arrival-time network, or
+            ``captures``, attempts of the task's best planner and what came of them, for a capture network.
+        out: folder; it may hold all three kinds of one scene.
+        episodes: paths, sequences of runs, or episodes with attempts.
         seed: series of episodes.
         num_envs: episodes that run in parallel; random numbers are drawn for the whole block.
         num_threads: of the simulation, 0 for all cores; does not change the data.
-        static: name of the static planner whose arrivals are measured; the task's default for None.
+        static: name of the static planner whose arrivals or captures are recorded; the task's default for None.
         weights: policy of that static planner, a file or a folder of its training; the shipped one for None.
         planner: your own static planner, whose arrivals are measured instead of those of ``static``.
         name: name of ``planner`` in the description.
@@ -180,7 +182,7 @@ class _Wanted:
         """Everything that determines the content of a shard, except its name."""
         episodes = sum(map(len, self.blocks(index)))
         made = {"scene": scene, "num_envs": str(self.num_envs), "episodes": str(episodes)}
-        if self.what == "arrivals":
+        if self.what != "paths":
             made["static"] = self.static
         if self.weights is not None:
             made["weights"] = hashlib.sha256(Path(self.weights).read_bytes()).hexdigest()[:16]
@@ -195,6 +197,11 @@ def _recorder(task: Task, wanted: _Wanted, planner: StaticPlanner | None) -> Cal
         if record_paths is None:
             raise InputError(f"{task.name} records no paths: give a file of tracks, by --from")
         return lambda index: record_paths(wanted.blocks(index), seed=wanted.seed, num_threads=threads)
+    if wanted.what == "captures":
+        record_captures = task.record_captures
+        if record_captures is None:
+            raise InputError(f"{task.name} records no captures")
+        return lambda index: record_captures(wanted.static, wanted.blocks(index), seed=wanted.seed, num_threads=threads)
     record_arrivals = task.record_arrivals
     if record_arrivals is None:
         raise InputError(f"{task.name} records no arrivals")

@@ -1,4 +1,4 @@
-"""Supervised fits of the forecaster and the arrival-time network to a task's collected data.
+"""Supervised fits of the forecaster, the arrival-time and the capture network to a task's collected data.
 
 Every fit takes the task; the folder ``data`` of its collected shards and their descriptions; a folder ``out``, which
 gets a folder of the network's name with checkpoint, curve, weights and card; and a `Recipe`, the task's own for None. A
@@ -16,18 +16,20 @@ from typing import Any
 
 import torch
 from torch import Tensor
-from torch.nn.functional import cross_entropy
+from torch.nn.functional import binary_cross_entropy_with_logits, cross_entropy
 
 from torchdyn_plan.errors import InputError
 from torchdyn_plan.files import short_path
+from torchdyn_plan.nets.capture import CaptureConfig, CaptureNetwork
 from torchdyn_plan.nets.eta import ETAConfig, ETANetwork, arrival_classes
 from torchdyn_plan.nets.forecaster import Forecaster, ForecasterConfig
 from torchdyn_plan.tasks.task import Task
 from torchdyn_plan.training.arrival_data import load_arrivals, split_groups
+from torchdyn_plan.training.capture_data import load_captures
 from torchdyn_plan.training.card import Tables, write_network
 from torchdyn_plan.training.fitting import Fitting
 from torchdyn_plan.training.lines import unreflect_paths
-from torchdyn_plan.training.metrics import arrival_errors, forecast_errors, lost_accuracy
+from torchdyn_plan.training.metrics import arrival_errors, capture_errors, forecast_errors, lost_accuracy
 from torchdyn_plan.training.optimise import Recipe, optimise
 from torchdyn_plan.training.path_data import PathSamples
 from torchdyn_plan.training.shards import read_description
@@ -150,8 +152,7 @@ def fit_eta(
     fitting = task_fitting(task)
     config, recipe = config or fitting.eta, recipe or fitting.recipe("eta")
     about = read_description(data, "arrivals", scene=task.digest())
-    if static not in (None, about["static"]):
-        raise InputError(f"arrivals in {short_path(Path(data))} are of {about['static']}, not of {static}")
+    check_driver(about, static, data)
     samples = load_arrivals(data, state_size=config.robot_state_size)
     if not config.never:
         latest = config.bins * config.bin_width - 1
@@ -184,6 +185,61 @@ def fit_eta(
     optimise(network, loss, lambda: _arrival_figures(score()), recipe, out=folder, settings=settings, resume=resume)
     facts = about | {"samples": len(samples.run), "held out": len(held.run)}
     return write_network(network, folder, score, task=words_of(task), recipe=recipe, facts=facts, network_name=name)
+
+
+def fit_capture(
+    task: Task,
+    data: Path,
+    out: Path,
+    recipe: Recipe | None = None,
+    *,
+    config: CaptureConfig | None = None,
+    static: str | None = None,
+    resume: bool = True,
+    name: str = CaptureNetwork.kind,
+) -> Path:
+    """Fit a `CaptureNetwork` to the ``captures`` in ``data``; one in ten runs is held out and scored.
+
+    ``config`` is the task's by default; ``name`` is the name of its folder in ``out``; data of another static planner
+    than ``static`` is refused, unless it is None; without ``resume`` a checkpoint in ``out`` is not continued.
+    """
+    fitting = task_fitting(task)
+    config, recipe = config or fitting.capture, recipe or fitting.recipe("capture")
+    if config is None:
+        raise InputError(f"{task.name} has no network of captures to fit")
+    about = read_description(data, "captures", scene=task.digest())
+    check_driver(about, static, data)
+    samples = load_captures(data, config)
+    train, held = (samples.take(rows) for rows in split_groups(samples.run, recipe.seed))
+    device = recipe.device
+    torch.manual_seed(recipe.seed)
+    network = CaptureNetwork(config)
+    network.set_input_statistics(train.window, train.goal)
+    network.to(device)
+
+    def loss(generator: torch.Generator) -> Tensor:
+        drawn = train.take(torch.randint(len(train.run), (recipe.batch,), generator=generator))
+        logits = network(drawn.window.to(device), drawn.goal.to(device))
+        return binary_cross_entropy_with_logits(logits, drawn.captured.to(logits))
+
+    def score() -> Tables:
+        logits = _in_parts(
+            lambda rows: network(held.window[rows].to(device), held.goal[rows].to(device)), len(held.run)
+        )
+        return {"Held-out attempts": capture_errors(logits, held, stride=config.stride)}
+
+    driver = {name: about[name] for name in ("static", "weights") if name in about}
+    settings = {"network": asdict(config), "scene": about["scene"], "samples": len(samples.run)} | driver
+    folder = out / name
+    optimise(network, loss, lambda: _capture_figures(score()), recipe, out=folder, settings=settings, resume=resume)
+    facts = about | {"samples": len(samples.run), "held out": len(held.run)}
+    return write_network(network, folder, score, task=words_of(task), recipe=recipe, facts=facts, network_name=name)
+
+
+def check_driver(about: dict[str, Any], static: str | None, data: Path) -> None:
+    """Raise `InputError` if the data described by ``about`` is of another static planner than ``static``, if given."""
+    if static not in (None, about["static"]):
+        raise InputError(f"the data in {short_path(Path(data))} is of {about['static']}, not of {static}")
 
 
 def _forecasts(network: Forecaster, windows: Windows, device: str) -> Tensor:
@@ -221,3 +277,9 @@ def _arrival_figures(tables: Tables) -> dict[str, float]:
             head = f"{row['estimator']}_{row['samples']}"
             figures |= {f"{head}_{name}": row[name] for name in ("mean", "p95", "never_accuracy")}
     return {name: value for name, value in figures.items() if value is not None}
+
+
+def _capture_figures(tables: Tables) -> dict[str, float]:
+    (rows,) = tables.values()
+    # By speed, groups may be empty.
+    return {name: rows[0][name] for name in ("loss", "ranked") if rows[0][name] is not None}

@@ -9,6 +9,7 @@ from typing import Any, NamedTuple
 from torch import Tensor
 
 from torchdyn_plan.checks import check_choice, check_number
+from torchdyn_plan.nets.capture import CaptureConfig
 from torchdyn_plan.nets.eta import ETAConfig
 from torchdyn_plan.nets.forecaster import ForecasterConfig
 from torchdyn_plan.planners import Lost
@@ -22,6 +23,7 @@ from torchdyn_plan.training.windows import WindowConfig, Windows
 RECIPES = {
     "forecaster": Recipe(steps=20_000, batch=512, lr=2e-3),
     "eta": Recipe(steps=64_000, batch=1024, lr=2e-3),
+    "capture": Recipe(steps=8_000, batch=512, lr=3e-3, weight_decay=5e-2, validations=8),
     "spread": Recipe(steps=3_000, batch=256, lr=2e-3, validations=8),
 }
 """Default recipe of each network."""
@@ -48,6 +50,8 @@ class Fitting:
     """Default configuration of the forecaster."""
     eta: ETAConfig = field(default_factory=ETAConfig)
     """Default configuration of the arrival-time network."""
+    capture: CaptureConfig | None = None
+    """Default configuration of the network of captures; None for none."""
     noisy_forecaster: ForecasterConfig | None = None
     """Configuration of a second forecaster, for noisy measurements seen through a track; None for none."""
     sighting: Sighting = field(default_factory=Sighting)

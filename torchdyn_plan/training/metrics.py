@@ -9,6 +9,7 @@ from torch import Tensor
 from torchdyn_plan.nets.eta import ESTIMATORS
 from torchdyn_plan.nets.spread import Spread
 from torchdyn_plan.planners import Lost
+from torchdyn_plan.training.capture_data import Captures
 from torchdyn_plan.training.windows import Windows
 
 FAST = 0.004
@@ -17,6 +18,8 @@ SHARES = (0.5, 0.8, 0.9, 0.95)
 """Probabilities of the intervals whose coverage is reported."""
 NEAR = 0.05
 """Distance along both horizontal axes within which a waiting robot has the target [m]."""
+CAPTURE_SPEEDS = (0.008, 0.014, 0.018)
+"""Speeds between which attempts at a capture are scored together [m a step]."""
 SOON = 30
 """Arrivals within fewer control steps than this are also scored separately."""
 
@@ -205,3 +208,48 @@ def _quantile(values: Tensor, share: float) -> float | None:
         return None
     rank = min(len(values), max(1, -int(-share * len(values) // 1)))
     return float(values.kthvalue(rank).values)
+
+
+def capture_errors(
+    logits: Tensor, held: Captures, *, stride: int, speeds: Sequence[float] = CAPTURE_SPEEDS
+) -> list[dict[str, Any]]:
+    """How well the probability of a capture is predicted, for all attempts and by the target's speed.
+
+    Args:
+        logits: ``(n,)`` of the predicted probability.
+        held: the n attempts.
+        stride: control steps between the positions of a window.
+        speeds: bounds of the groups [m a step].
+
+    Returns:
+        A row for each group: ``attempts``, their ``count``, the share ``captured``, the mean probability ``predicted``,
+        the ``loss`` (cross-entropy), and ``ranked``, the share of pairs of a captured and another attempt in which the
+        captured one has the higher probability; None where there is no such pair.
+    """
+    speed = (held.window[:, 1:] - held.window[:, :-1]).norm(dim=-1).amax(-1) / stride
+    groups = {"all": torch.ones_like(held.captured)}
+    for low, high in zip((0.0, *speeds), (*speeds, torch.inf), strict=True):
+        name = f"from {low:g}" if high == torch.inf else f"{low:g} to {high:g}"
+        groups[f"{name} m a step"] = (speed >= low) & (speed < high)
+    rows = []
+    for name, chosen in groups.items():
+        one, captured = logits[chosen].double(), held.captured[chosen]
+        figures = {"captured": None, "predicted": None, "loss": None}
+        if len(one):
+            figures = {
+                "captured": captured.double().mean().item(),
+                "predicted": one.sigmoid().mean().item(),
+                "loss": torch.nn.functional.binary_cross_entropy_with_logits(one, captured.double()).item(),
+            }
+        rows.append({"attempts": name, "count": len(one)} | figures | {"ranked": _ranked(one, captured)})
+    return rows
+
+
+def _ranked(score: Tensor, positive: Tensor) -> float | None:
+    """Share of pairs of a ``positive`` (n,) row and another that ``score`` (n,) ranks rightly; ties count half."""
+    better, worse = score[positive].sort().values, score[~positive]
+    if not len(better) or not len(worse):
+        return None
+    above = len(better) - torch.searchsorted(better, worse, right=True)
+    equal = torch.searchsorted(better, worse, right=True) - torch.searchsorted(better, worse)
+    return ((above + 0.5 * equal).double().mean() / len(better)).item()

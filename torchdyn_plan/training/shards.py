@@ -13,8 +13,8 @@ from torchdyn_plan.errors import InputError
 from torchdyn_plan.files import files_in, read_json, read_metadata, read_tensors, short_path, tensor_bytes
 from torchdyn_plan.schemas import Count, Positive, check_content
 
-SHARD = {"paths": 1024, "arrivals": 2048}
-"""Episodes in a shard of paths, and sequences of runs in a shard of arrivals."""
+SHARD = {"paths": 1024, "arrivals": 2048, "captures": 1024}
+"""Episodes in a shard of paths or captures, and sequences of runs in a shard of arrivals."""
 
 
 class Arguments(TypedDict):
@@ -24,7 +24,7 @@ class Arguments(TypedDict):
     seed: Count
     num_envs: Positive
     static: str
-    """Static planner of the arrivals; unused for paths."""
+    """Static planner of the arrivals or captures; unused for paths."""
 
 
 class Description(TypedDict):
@@ -54,12 +54,12 @@ def surplus_shards(folder: Path, stem: str, seed: int, count: int) -> list[Path]
 def read_description(data: Path, stem: str, *, scene: str) -> dict[str, Any]:
     """Description of the ``stem-*.safetensors`` in ``data``.
 
-    It has ``data``, the arguments of each collection; ``scene``; and for arrivals ``static`` and, for a policy with
+    It has ``data``, the arguments of each collection; ``scene``; and but for paths ``static`` and, for a policy with
     given weights, their digest as ``weights``.
 
     Args:
         data: folder of `torchdyn_plan.training.collect`.
-        stem: ``paths`` or ``arrivals``.
+        stem: ``paths``, ``arrivals`` or ``captures``.
         scene: digest of the scene that the data must come from.
 
     Raises:
@@ -158,7 +158,7 @@ def _check_shards(data: Path, stem: str, about: Description) -> dict[Path, dict[
     for index, episodes in enumerate(shard_sizes(stem, asked["episodes"])):
         path = shard_path(data, stem, asked["seed"], index)
         made = {"scene": about["scene"], "num_envs": str(asked["num_envs"]), "episodes": str(episodes)}
-        made |= {"static": asked["static"]} if stem == "arrivals" else {}
+        made |= {} if stem == "paths" else {"static": asked["static"]}
         there = _read_made(path)
         for name, value in made.items():
             if there.get(name) != value:
@@ -171,13 +171,13 @@ def _check_shards(data: Path, stem: str, about: Description) -> dict[Path, dict[
 
 
 def _check_alike(described: dict[Path, dict[str, str]]) -> None:
-    """Raise `InputError` if the shards' arrivals are of several static planners."""
+    """Raise `InputError` if the shards are of several static planners."""
     first = next(iter(described.values()))
     for path, there in described.items():
         if _driver(there) != _driver(first):
             raise InputError(
-                f"{short_path(path)} has arrivals of {_named(there)}, others in its folder of {_named(first)}: a "
-                "network is of one static planner, whose arrivals have a folder of their own"
+                f"{short_path(path)} has data of {_named(there)}, others in its folder of {_named(first)}: a "
+                "network is of one static planner, whose data has a folder of its own"
             )
 
 

@@ -19,6 +19,8 @@ def networks(task: Task) -> tuple[str, ...]:
         fitted += ("forecaster", "spread", f"{NOISY}forecaster", f"{NOISY}spread")
         if task.record_arrivals is not None:
             fitted += ("eta", NEAREST_ETA)
+        if task.record_captures is not None:
+            fitted += ("capture",)
     return (*fitted, *task.policies)
 
 
@@ -45,9 +47,9 @@ def train(
 
     Args:
         task: whose network, or its name.
-        network: ``forecaster``, ``eta``, ``nearest_eta``, ``spread``, ``noisy_forecaster`` and ``noisy_spread`` for
-            noisy measurements, or one of the task's policies. A spread is fitted to the errors of the forecaster in
-            ``out``, or of the shipped one if there is none.
+        network: ``forecaster``, ``eta``, ``nearest_eta``, ``capture``, ``spread``, ``noisy_forecaster`` and
+            ``noisy_spread`` for noisy measurements, or one of the task's policies. A spread is fitted
+            to the errors of the forecaster in ``out``, or of the shipped one if there is none.
         data: folder of the collected shards; not used for a policy.
         out: gets a folder of the network's name with checkpoint, curve, weights and card.
         steps: optimiser steps, or rounds for a policy; the recipe's value for None, as for ``batch`` and ``lr``.
@@ -59,7 +61,7 @@ def train(
         num_envs: for a policy: episodes simulated at once; the recipe's value for None.
         num_threads: for a policy: threads of the simulation, 0 for all cores; does not change the result.
         workers: for a policy: Ray workers that run the episodes, 0 for none.
-        static: for ``eta`` and ``nearest_eta``: static planner that the data must be of; any for None.
+        static: for ``eta``, ``nearest_eta`` and ``capture``: static planner that the data must be of; any for None.
         options: for a policy: an instance of its `PolicyTraining.options`; the defaults for None.
         algorithm: for a policy: ``ddpg`` or ``averaged``; the one of the task's recipe for None.
 
@@ -98,6 +100,8 @@ def train(
     if network in ("eta", NEAREST_ETA):
         config = dataclasses.replace(fitting.eta, never=network == "eta")
         return fit.fit_eta(task, data, out, recipe, config=config, static=static, resume=resume, name=network)
+    if network == "capture":
+        return fit.fit_capture(task, data, out, recipe, static=static, resume=resume)
     noisy = "" if kind == network else NOISY
     beside = out / f"{noisy}forecaster" / "forecaster.safetensors"
     ships = (task.path_weights or task.weights_name) + ("-noisy" if noisy else "")

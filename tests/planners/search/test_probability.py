@@ -4,9 +4,9 @@ import pytest
 import torch
 
 from tests.planners.search.test_exact import FULL, POCKETED, paths, robot
-from torchdyn_plan.nets import Arrival, Forecast, Spread
+from torchdyn_plan.nets import Arrival, Forecast, FunctionCapture, Spread
 from torchdyn_plan.nets.distributions import decode_distribution, decode_expectation
-from torchdyn_plan.planners import SearchContext
+from torchdyn_plan.planners import SearchContext, SoftExactSearch
 from torchdyn_plan.planners.search.exact import meeting_probability
 
 CAUTIOUS = dataclasses.replace(FULL, probability_weight=15.0)
@@ -174,3 +174,50 @@ def test_gradients_match_differences():
         return meeting_probability(arrival, arrival.steps.detach(), time, told, offset, half_width=HALF)
 
     assert torch.autograd.gradcheck(probability, (logits, scale, offset, time))
+
+
+def late_only(path, goal, steps):
+    """Captures nothing within 50 steps, and everything after that."""
+    return (steps >= 50).to(goal.dtype).expand(goal.shape[:-1])
+
+
+def resting(steps=90):
+    """A target that rests at one place for 50 steps, then at another one."""
+    forecast = torch.tensor([0.1, 0.0, 0.04]).repeat(steps, 1).double()
+    forecast[50:, 0] = 0.15
+    return forecast
+
+
+@pytest.mark.parametrize("soft", [False, True])
+def test_a_place_at_which_nothing_is_captured_is_left(soft):
+    forecast = resting()
+    eager = dataclasses.replace(CAUTIOUS, waiting_cost=0.1)
+    planner = SoftExactSearch(search=eager, temperature=0.1) if soft else eager
+    asked = blurred_robot() if not soft else robot()[0]
+
+    def met(capture):
+        context = SearchContext(tool_pos=torch.zeros(3).double(), lost=POCKETED, capture=capture)
+        found = planner(Forecast(forecast, spread=spread_of(scale=0.001)), forecast[0], asked, context)
+        return float(found.arrival_steps)
+
+    assert met(None) < 50 <= met(FunctionCapture(late_only))
+    assert met(FunctionCapture(lambda path, goal, steps: torch.ones_like(goal[..., 0]))) == pytest.approx(met(None))
+
+
+def test_captures_are_asked_about_the_whole_path_once():
+    forecast, here = paths(4, dtype=torch.float64)
+    asked = []
+
+    def capture(path, goal, steps):
+        asked.append((path, goal, steps))
+        return torch.ones_like(goal[..., 0])
+
+    known = {"capture": FunctionCapture(capture), "tool_pos": torch.zeros_like(here)}
+    CAUTIOUS(Forecast(forecast), here, blurred_robot(), SearchContext(**known))
+    ((path, goal, steps),) = asked
+    assert torch.equal(path, torch.cat([here.unsqueeze(-2), forecast], dim=-2))
+    candidates = CAUTIOUS.candidates(forecast, here)
+    assert torch.equal(goal, candidates.goals)
+    assert torch.equal(steps, candidates.target_steps)
+    FULL(Forecast(forecast), here, robot()[0], SearchContext(**known))
+    assert len(asked) == 1

@@ -62,7 +62,8 @@ class ExactSearch:
     With a ``base_pos`` places near the robot's axis count less: there it comes down too slowly for a fast target.
     With a ``probability_weight`` the probability of meeting counts too: that the robot is there ``descent_steps``
     before the target comes, by the whole distribution of the arrival time, and that the target is within the footprint
-    then, by the spread of the forecast.
+    then, by the spread of the forecast. With a ``capture`` in the context, it is also the probability that a robot that
+    waits there captures the target.
     """
 
     reads_turn: ClassVar[bool] = True
@@ -186,10 +187,11 @@ class ExactSearch:
             eta_steps, arrival = self._ask(candidates.goals, eta, context.tool_pos)
             probability = None
             if self.probability_weight > 0.0:
-                time = candidates.target_steps - self.descent_steps
-                offset = candidates.goals[..., :2] - candidates.places[..., :2]
-                spread = None if forecast.spread is None else forecast.spread.at(candidates.steps)
-                probability = meeting_probability(arrival, eta_steps, time, spread, offset, half_width=self.footprint)
+                probability = self._probability(candidates, forecast, arrival, eta_steps)
+                if context.capture is not None:
+                    whole = torch.cat([target_pos.unsqueeze(-2), forecast.path], dim=-2)
+                    seen = whole, candidates.goals, candidates.target_steps
+                    probability = probability * context.capture.probability(*seen)
             best, reachable = self._choose(candidates, kept, eta_steps, probability)
         goals, target_steps = candidates.goals, candidates.target_steps
         return Meeting(
@@ -207,6 +209,13 @@ class ExactSearch:
             return eta_steps, arrival
         away = (goals[..., :2] - tool_pos.unsqueeze(-2)[..., :2]).square().sum(-1)
         return eta_steps.masked_fill(away < self.arrival_radius**2, 0.0), arrival
+
+    def _probability(self, candidates: Candidates, forecast: Forecast, arrival: Arrival, eta_steps: Tensor) -> Tensor:
+        """`meeting_probability` of each candidate, ``(*B, K)``."""
+        time = candidates.target_steps - self.descent_steps
+        offset = candidates.goals[..., :2] - candidates.places[..., :2]
+        spread = None if forecast.spread is None else forecast.spread.at(candidates.steps)
+        return meeting_probability(arrival, eta_steps, time, spread, offset, half_width=self.footprint)
 
     def _choose(
         self, candidates: Candidates, kept: Tensor | None, eta_steps: Tensor, probability: Tensor | None = None

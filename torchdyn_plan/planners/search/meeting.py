@@ -8,6 +8,7 @@ from torch import Tensor
 
 if TYPE_CHECKING:
     from torchdyn_plan.nets.arrival import ArrivalQuery
+    from torchdyn_plan.nets.capture import CaptureModel
     from torchdyn_plan.nets.distributions import Arrival
     from torchdyn_plan.nets.forecast import Forecast
     from torchdyn_plan.planners.plan import Lost
@@ -35,6 +36,8 @@ class SearchContext(NamedTuple):
     """``(*B,)`` control steps from now to the meeting that was planned before."""
     lost: Lost | None = None
     """When a target is lost."""
+    capture: CaptureModel | None = None
+    """How likely it is that a robot that waits at a goal captures the target."""
     turn: Tensor | None = None
     """``(*B, F, 4)``: how a tool that meets the target on its forecast is to be turned, quaternions wxyz."""
 

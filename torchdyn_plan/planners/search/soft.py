@@ -40,7 +40,8 @@ LATENESS = 4.0
 class SoftExactSearch:
     """Soft form of `ExactSearch`: a mean over candidates instead of the best one.
 
-    Candidate k, met in t_k steps, has the hard search's score S_k (in steps, ``point`` of them for a point), the slack
+    Candidate k, met in t_k steps, has the hard search's score S_k (in steps, ``point`` of them for a point; with a
+    ``capture`` in the context, its probability counts ``probability_weight`` points), the slack
     s_k = t_k - descent - margin - e_k with the mean arrival time e_k, and the probability a_k that the robot arrives at
     all. With the temperature T
 
@@ -72,7 +73,7 @@ class SoftExactSearch:
             forecast: of the target in 1 … F control steps.
             target_pos: ``(*B, D)`` [m, world], the target now.
             eta: maps goals ``(*B, K, D)`` to arrivals ``(*B, K)``; called once, with ``estimator="soft"``.
-            context: of which it reads when a target is lost.
+            context: of which it reads when a target is lost, and the probability of a capture.
 
         Returns:
             The meeting, with ``arrival_steps`` in the forecast's dtype; ``reachable`` where it is rather in time.
@@ -91,7 +92,12 @@ class SoftExactSearch:
         never = arrival.never.to(arrival.steps.dtype)
         gate = in_time + logsigmoid(SURE * (0.5 - never) / heat)
         strict = LATENESS * (1.0 + 1.0 / heat)
-        worth = self.point * candidates.score / heat + strict * (gate - _apart(candidates) / heat)
+        score = candidates.score
+        if context.capture is not None:
+            whole = torch.cat([target_pos.unsqueeze(-2), forecast.path], dim=-2)
+            captured = context.capture.probability(whole, candidates.goals, candidates.target_steps)
+            score = score + hard.probability_weight * captured
+        worth = self.point * score / heat + strict * (gate - _apart(candidates) / heat)
         weights = worth.softmax(dim=-1)
         return Meeting(
             goal=exact_product(weights.unsqueeze(-2), candidates.goals).squeeze(-2),

@@ -15,6 +15,7 @@ from torchdyn_plan.nets.eta import ETAConfig
 from torchdyn_plan.nets.forecaster import ForecasterConfig
 from torchdyn_plan.planners import StaticPlanner
 from torchdyn_plan.planners.static.base import StaticPlannerModule
+from torchdyn_plan.tasks.trapper.attempts import CONFIG
 from torchdyn_plan.tasks.trapper.solvable import record_path
 from torchdyn_plan.tasks.trapper.task import ball_lost
 from torchdyn_plan.tasks.trapper.wait_and_drop import waiting_search
@@ -125,6 +126,7 @@ def trapper_fitting(scene: TrapperScene | str | None = None) -> Fitting:
             history=48, stride=2, tracked=True, square_symmetry=True, half_extent=scene.half_side - scene.ball_radius
         ),
         eta=ETAConfig(),
+        capture=CONFIG,
         spread=True,
         near=waiting_search(scene).footprint,
         lost=ball_lost(scene),

@@ -169,7 +169,7 @@ def exact(parts: PlannerParts) -> Any:
 
 def wait_and_drop(parts: PlannerParts) -> Any:
     """Waits above the most promising meeting, and drops in time: the best that there is."""
-    return waits_and_drops(parts, parts.forecaster_by_noise, parts.eta)
+    return waits_and_drops(parts, parts.forecaster_by_noise, parts.eta, parts.capture)
 
 
 def untrained(parts: PlannerParts) -> Any:
@@ -189,8 +189,8 @@ def pace_and_path(parts: PlannerParts) -> Any:
     return pace_and_path(trapper_scene(parts.task.scene), parts.static).eval()
 
 
-def waits_and_drops(parts: PlannerParts, forecaster: Any, eta: Any) -> Any:
-    """A planner that waits and drops, by this forecaster and this model of arrivals."""
+def waits_and_drops(parts: PlannerParts, forecaster: Any, eta: Any, capture: Any = None) -> Any:
+    """A planner that waits and drops, by this forecaster and these models of arrivals and captures."""
     from torchdyn_plan.envs.trapper.scene import trapper_scene
     from torchdyn_plan.planners import DynamicPlanner, ReplanSchedule
     from torchdyn_plan.tasks.trapper.wait_and_drop import WaitAndDrop, waiting_search
@@ -198,8 +198,9 @@ def waits_and_drops(parts: PlannerParts, forecaster: Any, eta: Any) -> Any:
     scene = trapper_scene(parts.task.scene)
     # Candidates are 5 steps apart: a plan every 5 steps keeps them on the same places, and so the waiting tool still.
     own = {
-        "search": waiting_search(scene),
-        "schedule": ReplanSchedule.every(5, first_step=13),
+        "capture": capture,
+        "search": waiting_search(scene, by_capture=capture is not None),
+        "schedule": ReplanSchedule.every(5, first_step=3),
         "maneuver": WaitAndDrop.of(scene),
     }
     return DynamicPlanner(parts.static, forecaster, eta, **own, **common(parts)).eval()
@@ -239,6 +240,14 @@ def record_arrivals(scene: Scene, planner: Any, **how: Any) -> dict[str, Any]:
     from torchdyn_plan.tasks.trapper.data import record_arm_runs
 
     return record_arm_runs(planner, scene=scene, **how)
+
+
+def record_captures(scene: Scene, static: str, blocks: Any, **how: Any) -> dict[str, Any]:
+    """As `Task.record_captures` says: attempts of *wait and drop*, which explores."""
+    from torchdyn_plan.tasks.trapper.attempts import record_attempts
+
+    planner = trapper_task(scene).planner("wait_and_drop", static)
+    return record_attempts(planner, blocks, scene=scene, **how)
 
 
 def fitting(scene: Scene) -> Any:
@@ -308,6 +317,7 @@ def trapper_task(scene: Scene) -> Task:
         measure=measure,
         record_paths=partial(record_paths, scene),
         record_arrivals=partial(record_arrivals, scene),
+        record_captures=partial(record_captures, scene),
         fitting=partial(fitting, scene),
         policies={
             "policy": PolicyTraining(

@@ -253,13 +253,14 @@ def pulled(level: Tensor, place: Tensor, pull: float) -> Tensor:
     return level + way * (length.clamp_max(pull) / length)
 
 
-def waiting_search(scene: TrapperScene, *, by_probability: bool = True) -> ExactSearch:
+def waiting_search(scene: TrapperScene, *, by_probability: bool = True, by_capture: bool = False) -> ExactSearch:
     """Meets the ball of ``scene`` with the rim 2 cm above it, as far out as the rails let the box stand.
 
     Rather not close to the arm's axis, where a drop takes twice as long. ``by_probability`` also weighs how likely a
-    meeting is, by the spread of the forecast and the distribution of the arrival time; then less margin is needed.
+    meeting is, by the spread of the forecast and the distribution of the arrival time; then less margin is needed. It
+    weighs more ``by_capture``, where the probability of a capture is known, too.
     """
-    approach = BoxApproach.of(scene)
+    approach, weight = BoxApproach.of(scene), 60.0 if by_capture else 30.0
     return ExactSearch(
         height=metres(2 * scene.ball_radius + 0.021),
         half_extent=approach.half_extent,
@@ -270,6 +271,6 @@ def waiting_search(scene: TrapperScene, *, by_probability: bool = True) -> Exact
         switching_cost=8.0,
         arrival_radius=0.015,
         base_pos=approach.base_pos[:2],
-        probability_weight=30.0 if by_probability else 0.0,
+        probability_weight=weight if by_probability else 0.0,
         margin=5.0 if by_probability else 15.0,
     )
