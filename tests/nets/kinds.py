@@ -64,6 +64,18 @@ def passings(rows: int) -> tuple[Tensor, Tensor]:
     return goal + 0.03 * speed * steps, goal.squeeze(-2)
 
 
+def stretches(rows: int) -> tuple[Tensor, Tensor]:
+    """Whole paths that pass goals after 40 control steps, and the goals."""
+    window, goal = passings(rows)
+    speed = (window[:, 1:2] - window[:, :1]) / 2.0
+    return goal.unsqueeze(1) + speed * torch.arange(-40.0, 41.0).unsqueeze(-1), goal
+
+
+def captured(network: Any, seen: tuple[Tensor, ...]) -> tuple[Tensor, ...]:
+    path, goal = seen
+    return (network.probability(path, goal.unsqueeze(-2), torch.tensor([40])),)
+
+
 def spread_forecaster() -> SpreadForecaster:
     return SpreadForecaster(Forecaster.from_pretrained("trapper"), SpreadNetwork.from_pretrained("trapper"))
 
@@ -124,6 +136,7 @@ KINDS = {
     "arrival": Kind(eta, queries, arrival, 1e-3),
     "arrival from a state": Kind(eta, queries, from_state, 1e-3),
     "capture": Kind(capture, passings, directly, 0.1),
+    "capture for inference": Kind(lambda: capture().for_inference(), stretches, captured, 1e-6),
     "actor": Kind(actor, queries, directly, 5e-3),
     "critic": Kind(critic, actor_inputs, directly, 5e-3),
     "forecaster for inference": Kind(lambda: forecaster().for_inference(), histories, directly, 1e-6),

@@ -127,3 +127,22 @@ def test_inputs_are_standardised_by_samples():
     given = torch.addcmul(model.shift, model._features(window, goal[:, 0, :2]), model.scale)
     torch.testing.assert_close(given.mean(0), torch.zeros(10, dtype=torch.float64), atol=1e-9, rtol=0)
     torch.testing.assert_close(given.std(0), torch.ones(10, dtype=torch.float64))
+
+
+@pytest.mark.parametrize("mirrored", [True, False])
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+def test_for_inference_it_is_the_same_function(mirrored, dtype):
+    model = network(mirrored=mirrored)
+    path, goal, when = passing(3, 2)
+    model.set_input_statistics(model.windows(path, when).flatten(0, 2), goal[..., :2].flatten(0, 2))
+    fast, expected = model.for_inference().to(dtype), model.probability(path, goal, when)
+    given = (path.to(dtype), goal.to(dtype), when)
+    torch.testing.assert_close(fast.probability(*given), expected.to(dtype))
+    assert all(torch.equal(a, b.to(dtype)) for a, b in zip(given[:2], (path, goal), strict=True))
+    other = torch.float32 if dtype == torch.float64 else torch.float64
+    found = fast.probability(path.to(other), goal.to(other), when)
+    assert found.dtype == other
+    torch.testing.assert_close(found.double(), expected, atol=1e-5, rtol=0)
+    torch.testing.assert_close(
+        fast.probability(path[0, 0].to(dtype), goal[0, 0].to(dtype), when[0, 0]), expected[0, 0].to(dtype)
+    )

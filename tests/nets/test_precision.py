@@ -130,7 +130,7 @@ def test_vmap_over_one_of_two_arguments(name, mapped):
     assert_close(found, kind.call(network, tuple(seen)))
 
 
-ASKED_BY_PLANNERS = ("spread for inference", "arrival from a state for inference")
+ASKED_BY_PLANNERS = ("spread for inference", "arrival from a state for inference", "capture for inference")
 """Forms that planners ask, which have judged what they read already: they look for no NaN again."""
 
 

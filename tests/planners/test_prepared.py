@@ -148,5 +148,6 @@ def test_what_is_saved_and_told_of_a_planner_does_not_depend_on_it(planner, tmp_
 
 
 def test_own_functions_are_asked_as_they_are(planner):
-    made = planner.with_parts(forecaster=lambda history: history, eta=lambda state, goal: goal[..., 0])
+    own = {"forecaster": lambda history: history, "eta": lambda state, goal: goal[..., 0], "capture": None}
+    made = planner.with_parts(**own)
     assert made.eval().prepared is None

@@ -25,7 +25,15 @@ from tests.planners.toy import (
 from tests.tasks.trapper.crossing import MANEUVER, POCKETED
 from torchdyn_plan.envs import TrapperEnv, TrapperScene
 from torchdyn_plan.errors import InputError, OutputError, WeightsError
-from torchdyn_plan.nets import Actor, ETANetwork, Forecaster, SpreadForecaster, SpreadNetwork, pretrained
+from torchdyn_plan.nets import (
+    Actor,
+    CaptureNetwork,
+    ETANetwork,
+    Forecaster,
+    SpreadForecaster,
+    SpreadNetwork,
+    pretrained,
+)
 from torchdyn_plan.planners import (
     CornerSearch,
     Delayed,
@@ -148,11 +156,14 @@ def test_one_that_waits_and_drops_comes_with_its_spread(shipped, due):
     noisy = Forecaster(hidden=8, channels=4, tracked=True), SpreadNetwork(features=8, tracked=True)
     for network in noisy:
         network.save_pretrained(shipped[0] / f"{network.kind}-trapper-noisy.safetensors")
+    with pytest.raises(WeightsError, match=r"capture of .*no weights .*capture-trapper-ik.* for CaptureNetwork"):
+        DynamicPlanner.from_pretrained("trapper-ik-wait_and_drop")
+    CaptureNetwork(hidden=8).save_pretrained(shipped[0] / "capture-trapper-ik.safetensors")
     planner = DynamicPlanner.from_pretrained("trapper-ik-wait_and_drop", chunk=4)
     assert isinstance(planner.forecaster.exact, SpreadForecaster)
     assert isinstance(planner.forecaster.noisy, SpreadForecaster)
-    assert (planner.search, planner.maneuver) == (waiting_search(SCENE), WaitAndDrop.of(SCENE))
-    assert (planner.schedule, planner.chunk) == (ReplanSchedule.every(5, first_step=13), 4)
+    assert (planner.search, planner.maneuver) == (waiting_search(SCENE, by_capture=True), WaitAndDrop.of(SCENE))
+    assert (planner.schedule, planner.chunk) == (ReplanSchedule.every(5, first_step=3), 4)
     with torch.no_grad():
         td = planner(due.clone())
     assert bool(td["goal"].isfinite().all())

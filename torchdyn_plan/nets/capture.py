@@ -5,7 +5,7 @@ from __future__ import annotations
 from abc import ABC, abstractmethod
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import torch
 from torch import Tensor, nn
@@ -14,6 +14,9 @@ from torchdyn_plan.checks import check_number, check_trailing_shape, network_inp
 from torchdyn_plan.errors import InputError
 from torchdyn_plan.nets.pretrained import Pretrained
 from torchdyn_plan.precision import Precise, autocast_is_on, in_type_of, without_autocast
+
+if TYPE_CHECKING:
+    from torchdyn_plan.nets.inference import InferenceCapture
 
 
 class CaptureModel(nn.Module, ABC):
@@ -28,6 +31,10 @@ class CaptureModel(nn.Module, ABC):
             goal: ``(*B, K, D)`` places at which the robot waits [m, world].
             steps: ``(*B, K)`` or ``(K,)`` int64 control steps from now until the target comes there.
         """
+
+    def for_inference(self) -> CaptureModel:
+        """The same function in as few operations as possible; by default the model itself."""
+        return self
 
 
 class FunctionCapture(CaptureModel):
@@ -145,6 +152,12 @@ class CaptureNetwork(Pretrained, Precise, CaptureModel):
         """As of `CaptureModel`; raises `InputError` for a wrong shape."""
         return self(self.windows(path, steps.expand(goal.shape[:-1])), goal).sigmoid()
 
+    def for_inference(self) -> InferenceCapture:
+        """A copy for inference with the current weights, in fewer operations; it does not follow later training."""
+        from torchdyn_plan.nets.inference import InferenceCapture
+
+        return InferenceCapture(self)
+
     def windows(self, path: Tensor, steps: Tensor) -> Tensor:
         """What is read of a path, ``(*B, K, positions, 2)`` [m, world].
 
@@ -152,9 +165,14 @@ class CaptureNetwork(Pretrained, Precise, CaptureModel):
             path: ``(*B, F + 1, D)`` from now on; before it and after it the target is taken to stand still.
             steps: ``(*B, K)`` int64 control steps from now until the target comes to each of K places.
         """
-        window, last = self.config.window, path.shape[-2] - 1
         check_trailing_shape("steps", steps, *path.shape[:-2], steps.shape[-1])
+        window = self.config.window
         about = torch.arange(-window, window + 1, self.config.stride, device=path.device)
-        index = (steps.unsqueeze(-1) + about).clamp(0, last).flatten(-2)
-        read = path[..., :2].gather(-2, index.unsqueeze(-1).expand(*index.shape, 2))
-        return read.unflatten(-2, (steps.shape[-1], len(about)))
+        return read_about(path, steps, about)
+
+
+def read_about(path: Tensor, steps: Tensor, about: Tensor) -> Tensor:
+    """Positions ``(*B, K, P, 2)`` of ``path`` (*B, F + 1, D) at ``steps`` (*B, K) + ``about`` (P,), within its ends."""
+    index = (steps.unsqueeze(-1) + about).clamp_(0, path.shape[-2] - 1).flatten(-2)
+    read = path[..., :2].gather(-2, index.unsqueeze(-1).expand(*index.shape, 2))
+    return read.view(*steps.shape, len(about), 2)

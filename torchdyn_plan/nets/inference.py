@@ -18,11 +18,13 @@ from torch.func import debug_unwrap
 
 from torchdyn_plan.checks import check_choice, network_input
 from torchdyn_plan.nets.arrival import ArrivalModel, ArrivalQuery
+from torchdyn_plan.nets.capture import CaptureModel, read_about
 from torchdyn_plan.nets.distributions import ESTIMATORS, Arrival, Spread, arrival_moments, without_never
 from torchdyn_plan.nets.forecast import DescribedForecast, Forecast, in_plane
 from torchdyn_plan.precision import Precise, autocast_is_on, in_type_of, without_autocast
 
 if TYPE_CHECKING:
+    from torchdyn_plan.nets.capture import CaptureNetwork
     from torchdyn_plan.nets.eta import ETANetwork
     from torchdyn_plan.nets.forecaster import Forecaster
     from torchdyn_plan.nets.spread import SpreadNetwork
@@ -359,6 +361,56 @@ class InferenceETA(Precise, ArrivalModel):
         rows = torch.addmm(self.head_bias, rows, self.head_weight)
         rows = rows.view(*hidden.shape[:-1], self.config.bins + self.config.never)
         return rows if self.config.never else without_never(rows)
+
+
+class InferenceCapture(Precise, CaptureModel):
+    """`CaptureNetwork` for inference; probabilities differ by rounding only.
+
+    The caller, such as a planner, must have checked for NaN.
+    """
+
+    about: Tensor
+    one: Tensor
+    first_weight: Tensor
+    first_bias: Tensor
+    second_weight: Tensor
+    second_bias: Tensor
+    head_weight: Tensor
+    head_bias: Tensor
+
+    def __init__(self, network: CaptureNetwork) -> None:
+        """Copy the current weights of ``network``."""
+        super().__init__()
+        self.config = config = network.config
+        dtype, exact = network.head.weight.dtype, copy.deepcopy(network).double()
+        steps = torch.arange(-config.window, config.window + 1, config.stride, device=exact.shift.device)
+        self.register_buffer("about", steps, persistent=False)
+        first, bias = exact.first.weight, exact.first.bias + exact.first.weight @ exact.shift
+        hold_constants(self, dtype, one=torch.ones(1), first_weight=(first * exact.scale).mT, first_bias=bias)
+        for name in ("second", "head"):
+            layer = getattr(exact, name)
+            hold_constants(self, dtype, **{f"{name}_weight": layer.weight.mT, f"{name}_bias": layer.bias})
+
+    def probability(self, path: Tensor, goal: Tensor, steps: Tensor) -> Tensor:
+        """As of `CaptureModel`."""
+        if autocast_is_on():
+            return without_autocast(self.probability, path, goal, steps)
+        batch, reach, size = goal.shape[:-1], self.config.reach, len(self.about)
+        about: Any = {"like": self.one, "owner": type(self).__name__, "finite": False}
+        seen = network_input("path", path, *path.shape[-2:], **about)
+        place = network_input("goal", goal, goal.shape[-1], **about)[..., :2].reshape(-1, 2)
+        away = read_about(seen, steps.expand(batch), self.about).view(len(place), size, 2)
+        away = away - place.unsqueeze(-2)
+        if self.config.mirrored:
+            left, ahead = place.split(1, dim=-1)
+            away[..., 0].mul_(torch.copysign(self.one, left))
+            near = [away.clamp_(-reach, reach).flatten(1), left.abs(), ahead]
+        else:
+            near = [away.clamp_(-reach, reach).flatten(1), place]
+        hidden = torch.addmm(self.first_bias, torch.cat(near, dim=-1), self.first_weight).relu_()
+        hidden = torch.addmm(self.second_bias, hidden, self.second_weight).relu_()
+        found = torch.addmm(self.head_bias, hidden, self.head_weight).sigmoid_().view(batch)
+        return found if found.dtype == goal.dtype else in_type_of(goal, found)
 
 
 def _turns(network: Forecaster) -> Tensor:

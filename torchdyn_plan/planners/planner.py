@@ -72,9 +72,10 @@ class DynamicPlanner(ComposedPlanner):
     def replan(self, observation: Observation, plan: Plan) -> Plan:
         """A new plan for every row, from the observation and the plan in use: a pure function."""
         delay = 0 if self.delivery is None else self.delivery.delay
-        forecaster, eta_model = self.forecaster, self.eta
+        forecaster, eta_model, capture = self.forecaster, self.eta, self.capture
         if self.prepared is not None and self.prepared.stands_for(observation.robot_state, *observation.seen):
-            forecaster, eta_model = self.prepared.copies
+            forecaster, eta_model, *others = self.prepared.copies
+            capture = others[0] if others else None
         forecast = forecaster.predict(*observation.seen[: len(self.forecaster.in_keys)])
         path, usable = usable_path(forecast.path, observation.target_pos)
         turn = None if self.turn is None else turn_after(delay, self.turn, path, observation)
@@ -84,7 +85,7 @@ class DynamicPlanner(ComposedPlanner):
             # From here on, times count from the step at which the plan becomes available.
             forecast, eta = forecast.after(delay), later(eta, delay)
             target_pos, planned_steps = path[..., delay - 1, :], (planned_steps - delay).clamp_min(0)
-        context = SearchContext(observation.tool_pos, planned_steps, self.lost, self.capture, turn)
+        context = SearchContext(observation.tool_pos, planned_steps, self.lost, capture, turn)
         meeting = self.search(forecast, target_pos, eta, context)
         return Plan.make(meeting, usable, target_pos, forecast.path, self.memory.path_length)
 
