@@ -54,8 +54,13 @@ def test_the_mallet_is_there_and_gives_way_within_its_limits(hockey, tmp_path, v
     joints, speeds, places = [-1.156, 1.3, 1.443], [0.0] * 3, []
     for _ in range(70):
         seen = {"puck_pos": [puck[0].item() + 1.51, puck[1].item(), 0.0], "puck_vel": [*velocity.tolist(), 0.0]}
+        before, slower = torch.tensor(joints), torch.tensor(speeds)
         with torch.no_grad():
             joints, speeds = agent.act(seen | {"joint_pos": joints, "joint_vel": speeds})
+        # Speeds change evenly within the step, and not faster than the acceleration limit.
+        mean, change = 0.5 * (slower + torch.tensor(speeds)), torch.tensor(speeds) - slower
+        torch.testing.assert_close(torch.tensor(joints) - before, STEP * mean, atol=1e-5, rtol=0.0)
+        assert (change.abs() <= agent.own.quick * STEP * torch.tensor(about["joint_acc"]) + 1e-5).all()
         places.append(agent.state["tool_pos"][0])
         assert all(abs(speed) <= 0.9 * most for speed, most in zip(speeds, about["joint_vel"], strict=True))
         if (places[-1][:2] - puck).norm() < 0.0799:
