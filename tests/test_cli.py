@@ -239,7 +239,7 @@ BAD = [
         "a planner takes and returns a tensordict, but 'math:pi' is float",
     ),
     (["collect", "paths", "--planner", "math:cos", "--out", "{new}"], "--planner is of arrivals, not of paths"),
-    (["train", "dher"], "unknown network of trapper 'dher'; choose from eta, forecaster, nearest_eta, noisy_"),
+    (["train", "dher"], "unknown network of trapper 'dher'; choose from capture, eta, forecaster, nearest_eta, noisy_"),
     (["train", "eta", "--static", "kuka", "--out", "{new}"], "unknown static planner of trapper 'kuka'"),
     (["train", "eta"], "no arrivals-*.json in 'runs/data/trapper-ik'"),
     (["train", "eta", "--static", "rl"], "no arrivals-*.json in 'runs/data/trapper-rl'"),

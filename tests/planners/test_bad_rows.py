@@ -83,7 +83,7 @@ def test_a_row_that_begins_badly_recovers(planner, key):
         acted = planner(shown)
         if step < 4 and key != "target_pos":
             assert not acted["action"][ROW].any()
-        if step == 4 and isinstance(planner, DynamicPlanner):
+        if step == 4 and isinstance(planner, DynamicPlanner) and not acted["plan", "replanned"][ROW]:
             # It holds the tool where it is, and does not go to where zeros would have been a goal.
             assert (acted["goal"][ROW] - td["tool_pos"][ROW]).norm() < 0.02
         td["action"] = acted["action"]

@@ -18,7 +18,7 @@ from torch.func import debug_unwrap
 
 from torchdyn_plan.checks import check_choice, network_input
 from torchdyn_plan.nets.arrival import ArrivalModel, ArrivalQuery
-from torchdyn_plan.nets.capture import CaptureModel, read_about
+from torchdyn_plan.nets.capture import CaptureModel
 from torchdyn_plan.nets.distributions import ESTIMATORS, Arrival, Spread, arrival_moments, without_never
 from torchdyn_plan.nets.forecast import DescribedForecast, Forecast, in_plane
 from torchdyn_plan.precision import Precise, autocast_is_on, in_type_of, without_autocast
@@ -43,8 +43,8 @@ def hold_constants(module: nn.Module, dtype: torch.dtype, **constants: Tensor) -
 class Prepared:
     """Copies of models for inference, and the weights they were made from."""
 
-    def __init__(self, models: Sequence[nn.Module], copies: Sequence[Any]) -> None:
-        """Hold ``copies`` of ``models``, made just now."""
+    def __init__(self, models: Sequence[nn.Module | None], copies: Sequence[Any]) -> None:
+        """Hold ``copies`` of ``models``, made just now; None for one that there is not."""
         self.copies = tuple(copies)
         self._weights = [(table, name, value, value._version) for table, name, value in _weights_of(models)]
 
@@ -54,7 +54,7 @@ class Prepared:
         weights = [value for _, _, value in _weights_of(models)]
         if any(value.requires_grad or value.is_inference() or _is_shared(value) for value in weights):
             return None
-        copies = [model.for_inference() for model in models]
+        copies = [None if model is None else model.for_inference() for model in models]
         return None if all(map(operator.is_, copies, models)) else cls(models, copies)
 
     def stands_for(self, *inputs: Tensor) -> bool:
@@ -73,9 +73,10 @@ class Prepared:
         )
 
 
-def _weights_of(models: Iterable[nn.Module]) -> list[tuple[dict[str, Any], str, Tensor]]:
+def _weights_of(models: Iterable[nn.Module | None]) -> list[tuple[dict[str, Any], str, Tensor]]:
     """Every parameter and buffer of ``models``: the dictionary that holds it, and its name there."""
-    tables = [table for model in models for part in model.modules() for table in (part._parameters, part._buffers)]
+    parts = [part for model in models if model is not None for part in model.modules()]
+    tables = [table for part in parts for table in (part._parameters, part._buffers)]
     return [(table, name, value) for table in tables for name, value in table.items() if value is not None]
 
 
@@ -395,12 +396,16 @@ class InferenceCapture(Precise, CaptureModel):
         """As of `CaptureModel`."""
         if autocast_is_on():
             return without_autocast(self.probability, path, goal, steps)
-        batch, reach, size = goal.shape[:-1], self.config.reach, len(self.about)
-        about: Any = {"like": self.one, "owner": type(self).__name__, "finite": False}
-        seen = network_input("path", path, *path.shape[-2:], **about)
-        place = network_input("goal", goal, goal.shape[-1], **about)[..., :2].reshape(-1, 2)
-        away = read_about(seen, steps.expand(batch), self.about).view(len(place), size, 2)
-        away = away - place.unsqueeze(-2)
+        if path.dtype != self.one.dtype or goal.dtype != self.one.dtype:
+            about: Any = {"like": self.one, "owner": type(self).__name__, "finite": False}
+            seen = network_input("path", path, *path.shape[-2:], **about)
+            place = network_input("goal", goal, goal.shape[-1], **about)
+            return self.probability(seen, place, steps).to(in_type_of(goal, goal))
+        batch, reach = goal.shape[:-1], self.config.reach
+        # As `read_about`, whose call would take as long as an operation.
+        index = (steps.expand(batch).unsqueeze(-1) + self.about).clamp_(0, path.shape[-2] - 1).flatten(-2)
+        read, place = path.gather(-2, index.unsqueeze(-1).expand(*index.shape, 2)), goal[..., :2].reshape(-1, 2)
+        away = read.view(len(place), len(self.about), 2) - place.unsqueeze(-2)
         if self.config.mirrored:
             left, ahead = place.split(1, dim=-1)
             away[..., 0].mul_(torch.copysign(self.one, left))

@@ -182,7 +182,7 @@ class ComposedPlanner(PretrainedPlanner, Remembering):
 
     def prepare(self) -> Self:
         """Copy the current models for inference, or drop the copies in training mode. Returns the planner."""
-        self.prepared = None if self.training else Prepared.of(*self._models)
+        self.prepared = None if self.training else Prepared.of(self.forecaster.chosen, self.eta, self.capture)
         return self
 
     def _apply(self, fn: Callable[[Tensor], Tensor], recurse: bool = True) -> Self:
@@ -197,12 +197,6 @@ class ComposedPlanner(PretrainedPlanner, Remembering):
     def __setstate__(self, state: dict[str, Any]) -> None:
         super().__setstate__(state)
         self.prepare()
-
-    @property
-    def _models(self) -> list[Any]:
-        """The models that make a plan: of the forecast, of the arrival, and of captures if there is one."""
-        models = [self.forecaster.chosen, self.eta]
-        return models if self.capture is None else [*models, self.capture]
 
     def for_inference(self) -> Self:
         """A copy with the current networks prepared for inference, in as few operations as possible."""

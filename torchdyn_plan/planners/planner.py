@@ -74,8 +74,7 @@ class DynamicPlanner(ComposedPlanner):
         delay = 0 if self.delivery is None else self.delivery.delay
         forecaster, eta_model, capture = self.forecaster, self.eta, self.capture
         if self.prepared is not None and self.prepared.stands_for(observation.robot_state, *observation.seen):
-            forecaster, eta_model, *others = self.prepared.copies
-            capture = others[0] if others else None
+            forecaster, eta_model, capture = self.prepared.copies
         forecast = forecaster.predict(*observation.seen[: len(self.forecaster.in_keys)])
         path, usable = usable_path(forecast.path, observation.target_pos)
         turn = None if self.turn is None else turn_after(delay, self.turn, path, observation)

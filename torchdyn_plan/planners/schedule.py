@@ -155,7 +155,10 @@ class ReplanSchedule:
         if not (torch.compiler.is_compiling() or debug_unwrap(over).any()):
             return clock, over
         due = over if busy is None else over & ~busy
-        window = torch.where(due, self.next_window(clock.window), clock.window)
+        window = clock.window
+        # A fixed period is the same after every plan.
+        if self.minimum != self.window:
+            window = torch.where(due, self.next_window(window), window)
         return Clock(window, torch.where(over, window, clock.countdown), clock.replans + due), due
 
 

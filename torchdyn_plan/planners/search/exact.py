@@ -187,7 +187,10 @@ class ExactSearch:
             eta_steps, arrival = self._ask(candidates.goals, eta, context.tool_pos)
             probability = None
             if self.probability_weight > 0.0:
-                probability = self._probability(candidates, forecast, arrival, eta_steps)
+                time = candidates.target_steps - self.descent_steps
+                offset = candidates.goals[..., :2] - candidates.places[..., :2]
+                spread = None if forecast.spread is None else forecast.spread.at(candidates.steps)
+                probability = meeting_probability(arrival, eta_steps, time, spread, offset, half_width=self.footprint)
                 if context.capture is not None:
                     whole = torch.cat([target_pos.unsqueeze(-2), forecast.path], dim=-2)
                     seen = whole, candidates.goals, candidates.target_steps
@@ -209,13 +212,6 @@ class ExactSearch:
             return eta_steps, arrival
         away = (goals[..., :2] - tool_pos.unsqueeze(-2)[..., :2]).square().sum(-1)
         return eta_steps.masked_fill(away < self.arrival_radius**2, 0.0), arrival
-
-    def _probability(self, candidates: Candidates, forecast: Forecast, arrival: Arrival, eta_steps: Tensor) -> Tensor:
-        """`meeting_probability` of each candidate, ``(*B, K)``."""
-        time = candidates.target_steps - self.descent_steps
-        offset = candidates.goals[..., :2] - candidates.places[..., :2]
-        spread = None if forecast.spread is None else forecast.spread.at(candidates.steps)
-        return meeting_probability(arrival, eta_steps, time, spread, offset, half_width=self.footprint)
 
     def _choose(
         self, candidates: Candidates, kept: Tensor | None, eta_steps: Tensor, probability: Tensor | None = None
