@@ -18,6 +18,11 @@ def rows_of(name):
     return json.loads((RESULTS / name).read_text())["rows"]
 
 
+def rows_in(folder):
+    """Rows of a sweep, and of the separate one of *wait and drop*."""
+    return [*rows_of(f"{folder}/results.json"), *rows_of(f"{folder}/wait_and_drop.json")]
+
+
 def table(page, head):
     """The table on a page whose head begins with ``head``: the first cell of each line, the numbers of the others."""
     lines = (ROOT / page).read_text().splitlines()
@@ -53,8 +58,7 @@ def at(rows, planner, **settings):
 
 
 def test_velocity():
-    rows = [row for row in rows_of("velocity/results.json") if row["planner"] != "wait_and_drop"]
-    rows += rows_of("velocity/wait_and_drop.json")
+    rows = rows_in("velocity")
     order = ("pursuit", "corner", "corner_never", "oracle", "recorded_oracle", "exact", "wait_and_drop")
     for first, printed in table("docs/results.md", "velocity | solvable | target pursuit | corner | corner, arrivals"):
         expected = []
@@ -67,8 +71,7 @@ def test_velocity():
 
 
 def test_velocity_with_the_policy():
-    rows, ik = rows_of("policy/velocity/results.json"), rows_of("velocity/results.json")
-    waiting = rows_of("velocity/wait_and_drop.json")
+    rows, ik = rows_in("policy/velocity"), rows_in("velocity")
     for first, printed in table("docs/results.md", "velocity | solvable | target pursuit | corner | oracle"):
         velocity, expected = float(first.split()[0]), []
         for planner in ("pursuit", "corner", "oracle"):
@@ -77,13 +80,13 @@ def test_velocity_with_the_policy():
             expected += [row["success_solvable"], row["paper_success_solvable"]]
         expected.append(at(rows, "wait_and_drop", velocity=velocity)["success_solvable"])
         expected.append(at(ik, "corner", velocity=velocity)["success_solvable"])
-        expected.append(at(waiting, "wait_and_drop", velocity=velocity)["success_solvable"])
+        expected.append(at(ik, "wait_and_drop", velocity=velocity)["success_solvable"])
         agree(printed, expected, first)
 
 
 def test_friction_in_the_text():
     text = (ROOT / "docs" / "results.md").read_text()
-    rows = rows_of("friction/results.json")
+    rows = rows_in("friction")
     (found,) = re.findall(r"friction sweep at 3 m/s \(0 to 9\.5 N\)(.*?)\(`torchdyn", text, re.DOTALL)
     values = [0.0, 2.5, 5.0, 7.5, 9.5]
     expected = [
@@ -216,7 +219,7 @@ def test_distances_from_the_paper():
 
 
 def test_scene_of_the_paper_with_the_policy():
-    rows = rows_of("paper_policy/results.json")
+    rows = rows_in("paper_policy")
     for first, printed in table("docs/reproduction.md", "m/s | solvable | pursuit | corner | oracle | wait and drop"):
         expected = []
         for planner in ("pursuit", "corner", "oracle"):

@@ -114,7 +114,7 @@ def plot_sweep(task: Task, rows: Sequence[ResultRow], over: str, path: Path) -> 
         axes.grid(alpha=0.3)
     all_axes[0].set_ylabel("success rate")
     handles, labels = all_axes[0].get_legend_handles_labels()
-    figure.legend(handles, labels, loc="outside lower center", ncols=min(len(labels), 8), frameon=False)
+    figure.legend(handles, labels, loc="outside lower center", ncols=min(len(labels), 5), frameon=False)
     _set_title(figure, task, rows[0], [name for name in rows[0].settings if name != over])
     _save(figure, path)
 
