@@ -41,13 +41,13 @@ def test_an_attempt_counts_if_the_robot_was_there_in_time():
     kept.watch(torch.stack([here[0], far[1], far[2]]), torch.full((3,), 20))
     kept.watch(torch.stack([far[0], here[1], far[2]]), torch.full((3,), 3))
     kept.end(rows(0, 1, 2), captured=True)
-    ((seen, goal, captured, row),) = kept.ended
-    assert row.tolist() == [1]
+    seen, goal, captured, row = kept.found(first=10)
+    assert row.tolist() == [11]
     assert captured.tolist() == [True]
     assert torch.equal(seen, window[1:2])
     assert torch.equal(goal, here[1:2, :2])
     kept.end(rows(0, 1, 2), captured=False)
-    assert len(kept.ended) == 1
+    assert len(kept.found().run) == 1
 
 
 def test_a_new_plan_replaces_an_attempt_and_its_time():
@@ -59,12 +59,12 @@ def test_a_new_plan_replaces_an_attempt_and_its_time():
     kept.renew(rows(0), window + 1.0, here + 5.0)
     assert kept.past.tolist() == [0, 0, 0]
     kept.end(rows(0), captured=True)
-    assert not kept.ended
+    assert not len(kept.found().run)
     kept.renew(rows(0), window + 2.0, here)
     kept.watch(here, torch.zeros(3))
     kept.drop(rows(0))
     kept.end(rows(0), captured=True)
-    assert not kept.ended
+    assert not len(kept.found().run)
 
 
 def test_an_explorer_draws_anew_within_its_bounds():

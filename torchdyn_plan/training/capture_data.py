@@ -111,7 +111,8 @@ class Attempts:
         self.past = torch.zeros(count, dtype=torch.int64)
         # Early plans see all of the window ahead, late ones only a part of it.
         self.soonest = SOONEST + (SOONEST_RANGE * torch.rand(count, generator=draw).square()).long()
-        self.ended: list[tuple[Tensor, Tensor, Tensor, Tensor]] = []
+        # An empty one is there if none ends.
+        self.ended = [Captures(self.window[:0], self.goal[:0], self.open[:0], self.past[:0])]
 
     def renew(self, rows: Tensor, window: Tensor, goal: Tensor) -> None:
         """Begin attempts in ``rows`` (N,), with ``window`` (N, positions, 2) and ``goal`` (N, D), instead of others."""
@@ -130,8 +131,13 @@ class Attempts:
         kept = (rows & self.open & self.there).nonzero().squeeze(-1)
         if len(kept):
             outcome = torch.full((len(kept),), captured)
-            self.ended.append((self.window[kept], self.goal[kept], outcome, kept))
+            self.ended.append(Captures(self.window[kept], self.goal[kept], outcome, kept))
         self.open, self.there = self.open & ~rows, self.there & ~rows
+
+    def found(self, first: int = 0) -> Captures:
+        """All attempts that have ended; the first environment counts as run ``first``."""
+        whole = Captures(*map(torch.cat, zip(*self.ended, strict=True)))
+        return whole._replace(run=whole.run + first)
 
     def drop(self, rows: Tensor) -> None:
         """Forget attempts in ``rows`` (N,) of which nothing came."""

@@ -23,8 +23,6 @@ LEAST = 0.5
 """Least factor by which an exploring planner multiplies the worth of a meeting."""
 SWITCHING_COST = 18.0
 """Keeps an exploring planner at the meeting that it chose, though it draws anew at each plan."""
-
-
 CONFIG = CaptureConfig(mirrored=True)
 """Sizes of the network of captures."""
 
@@ -94,5 +92,4 @@ def record_block(planner: Any, env: TrapperEnv, draw: torch.Generator, *, first:
         attempts.end(done & pocketed, captured=False)
         attempts.end((attempts.past > PASSED) & (drops < 0), captured=False)
         attempts.drop(done)
-    windows, goals, captured, rows = map(torch.cat, zip(*attempts.ended, strict=True))
-    return Captures(windows, goals, captured, rows + first)
+    return attempts.found(first)
