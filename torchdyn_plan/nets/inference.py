@@ -414,8 +414,7 @@ class InferenceCapture(Precise, CaptureModel):
             near = [away.clamp_(-reach, reach).flatten(1), place]
         hidden = torch.addmm(self.first_bias, torch.cat(near, dim=-1), self.first_weight).relu_()
         hidden = torch.addmm(self.second_bias, hidden, self.second_weight).relu_()
-        found = torch.addmm(self.head_bias, hidden, self.head_weight).sigmoid_().view(batch)
-        return found if found.dtype == goal.dtype else in_type_of(goal, found)
+        return torch.addmm(self.head_bias, hidden, self.head_weight).sigmoid_().view(batch)
 
 
 def _turns(network: Forecaster) -> Tensor:

@@ -32,7 +32,7 @@ from torchdyn_plan.training.lines import unreflect_paths
 from torchdyn_plan.training.metrics import arrival_errors, capture_errors, forecast_errors, lost_accuracy
 from torchdyn_plan.training.optimise import Recipe, optimise
 from torchdyn_plan.training.path_data import PathSamples
-from torchdyn_plan.training.shards import read_description
+from torchdyn_plan.training.shards import driver_of, read_description
 from torchdyn_plan.training.sighted_data import SightedSamples
 from torchdyn_plan.training.windows import Windows
 
@@ -179,8 +179,8 @@ def fit_eta(
         rows = arrival_errors(logits, held.arrival, groups, bin_width=config.bin_width)
         return {"Errors on held-out runs [control steps]": rows}
 
-    driver = {name: about[name] for name in ("static", "weights") if name in about}
-    settings = {"network": asdict(config), "scene": about["scene"], "samples": len(samples.run)} | driver
+    settings = {"network": asdict(config), "scene": about["scene"], "samples": len(samples.run)}
+    settings |= driver_of(about)
     folder = out / name
     optimise(network, loss, lambda: _arrival_figures(score()), recipe, out=folder, settings=settings, resume=resume)
     facts = about | {"samples": len(samples.run), "held out": len(held.run)}
@@ -228,8 +228,8 @@ def fit_capture(
         )
         return {"Held-out attempts": capture_errors(logits, held, stride=config.stride)}
 
-    driver = {name: about[name] for name in ("static", "weights") if name in about}
-    settings = {"network": asdict(config), "scene": about["scene"], "samples": len(samples.run)} | driver
+    settings = {"network": asdict(config), "scene": about["scene"], "samples": len(samples.run)}
+    settings |= driver_of(about)
     folder = out / name
     optimise(network, loss, lambda: _capture_figures(score()), recipe, out=folder, settings=settings, resume=resume)
     facts = about | {"samples": len(samples.run), "held out": len(held.run)}

@@ -91,7 +91,7 @@ def read_description(data: Path, stem: str, *, scene: str) -> dict[str, Any]:
             "of more episodes: collect again, or delete it"
         )
     _check_alike(described)
-    return {"data": arguments, "scene": scene} | _driver(next(iter(described.values())))
+    return {"data": arguments, "scene": scene} | driver_of(next(iter(described.values())))
 
 
 def read_shards(folder: Path, stem: str, names: Sequence[str]) -> list[dict[str, Tensor]]:
@@ -174,17 +174,17 @@ def _check_alike(described: dict[Path, dict[str, str]]) -> None:
     """Raise `InputError` if the shards are of several static planners."""
     first = next(iter(described.values()))
     for path, there in described.items():
-        if _driver(there) != _driver(first):
+        if driver_of(there) != driver_of(first):
             raise InputError(
                 f"{short_path(path)} has data of {_named(there)}, others in its folder of {_named(first)}: a "
                 "network is of one static planner, whose data has a folder of its own"
             )
 
 
-def _driver(made: dict[str, str]) -> dict[str, str]:
-    """Static planner of a shard, from its metadata; empty for paths."""
+def driver_of(made: Mapping[str, Any]) -> dict[str, Any]:
+    """Static planner of a shard or of a description, from what it says of itself; empty for paths."""
     return {name: made[name] for name in ("static", "weights") if name in made}
 
 
 def _named(made: dict[str, str]) -> str:
-    return " with weights ".join(_driver(made).values())
+    return " with weights ".join(driver_of(made).values())
