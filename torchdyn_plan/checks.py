@@ -10,6 +10,7 @@ from collections.abc import Iterable, Sequence
 
 import torch
 from torch import Tensor
+from torch.autograd import forward_ad
 from torch.func import debug_unwrap
 
 from torchdyn_plan.errors import InputError
@@ -96,6 +97,14 @@ def network_input(
 def hides_values(tensor: Tensor) -> bool:
     """Whether results may not depend on looking at ``tensor``: it is compiled, or stands for many under ``vmap``."""
     return torch.compiler.is_compiling() or debug_unwrap(tensor) is not tensor
+
+
+def is_followed(*tensors: Tensor) -> bool:
+    """Whether derivatives are taken through one of ``tensors``, in any of PyTorch's ways."""
+    if forward_ad._current_level >= 0:
+        return True
+    grad = torch.is_grad_enabled()
+    return any((grad and tensor.requires_grad) or debug_unwrap(tensor) is not tensor for tensor in tensors)
 
 
 def check_choice(name: str, value: str, choices: Iterable[str]) -> None:

@@ -236,11 +236,13 @@ def test_a_batch_is_its_rows(track, dtype):
     places[1, 2, 9:] += 0.3
     whole = measured(track, times, places)
     assert whole.motion.dtype == dtype
+    # One row is computed in 64 bits and stored in those of the track.
+    rtol, atol = (1e-9, 1e-12) if dtype == torch.float64 else (3e-4, 1e-5)
     for i in range(2):
         for j in range(3):
             row = measured(track, times, places[i, j])
             for name, one, other in zip(whole._fields, whole, row, strict=True):
-                torch.testing.assert_close(one[i, j], other, rtol=1e-5, atol=1e-7, msg=name)
+                torch.testing.assert_close(one[i, j], other, rtol=rtol, atol=atol, msg=name)
 
 
 class Operations(TorchDispatchMode):
@@ -256,11 +258,12 @@ class Operations(TorchDispatchMode):
 
 
 @pytest.mark.parametrize(
-    ("track", "most"), list(zip(KINDS, (31, 56, 33), strict=True)), ids=["velocity", "acceleration", "least squares"]
+    ("track", "rows", "most"),
+    [(KINDS[0], 2, 36), (KINDS[1], 2, 61), (KINDS[2], 2, 38), *((track, 1, 12) for track in KINDS)],
 )
-def test_a_measurement_takes_few_operations_and_none_takes_nearly_none(track, most):
-    times, places, _, _ = line(1, noise=0.001)
-    state, now = measured(track, times[:-1], places[:, :-1]), times[-1:]
+def test_a_measurement_takes_few_operations_and_none_takes_nearly_none(track, rows, most):
+    times, places, _, _ = line(rows, noise=0.001)
+    state, now = measured(track, times[:-1], places[:, :-1]), times[-1:].expand(rows)
     with Operations() as taken:
         after = track.add(state, now, places[:, -1], now)
     assert (after.used == 20).all()
@@ -268,7 +271,7 @@ def test_a_measurement_takes_few_operations_and_none_takes_nearly_none(track, mo
     never = torch.full_like(now, torch.nan)
     with Operations() as nothing:
         assert track.add(state, never, places[:, -1], now) is state
-    assert nothing.count <= 2
+    assert nothing.count <= 2 * rows
 
 
 @ALL
@@ -306,6 +309,16 @@ def test_it_is_differentiable(track, bad):
     assert all(gradient.isfinite().all() for gradient in gradients)
     assert gradients[0][5].abs().sum() > 0.0
     assert torch.autograd.gradcheck(forecast, inputs)
+
+
+def test_derivatives_of_one_target_go_forward_too():
+    times, places, _, velocity = line(count=4)
+
+    def last(places):
+        return measured(KINDS[0], times, places).pos
+
+    moved = torch.func.jvp(last, (places,), (torch.ones_like(places),))[1]
+    torch.testing.assert_close(moved, torch.ones_like(velocity))
 
 
 @pytest.mark.parametrize(

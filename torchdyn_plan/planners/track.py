@@ -18,9 +18,17 @@ import torch
 from torch import Tensor
 from torch.func import debug_unwrap
 
-from torchdyn_plan.checks import POINT_SIZES, check_number, check_trailing_shape, check_vector, hides_values
+from torchdyn_plan.checks import (
+    POINT_SIZES,
+    check_number,
+    check_trailing_shape,
+    check_vector,
+    hides_values,
+    is_followed,
+)
 from torchdyn_plan.errors import InputError
 from torchdyn_plan.planners.rows import where_rows
+from torchdyn_plan.planners.track_row import updated_row
 
 LARGEST = 1e6
 """Measurements farther from the origin [m], or with a larger time stamp [s], are rejected."""
@@ -220,6 +228,8 @@ class Track(ABC):
             return state
         measured = Measurement(time, pos, self.noise**2 if variance is None else variance)
         if looks and _is_in_order(debug_unwrap(state.time), debug_unwrap(time), debug_unwrap(now)):
+            if _is_row(state.motion, state.time, measured) and (motion := self._row(state, measured)) is not None:
+                return state._replace(motion=motion, time=time, used=state.used + 1)
             expected = self._expect_next(state, measured)
             # The least of what is no number is no number, which is not above zero.
             if debug_unwrap(self._slack(expected)).min().item() >= 0.0:
@@ -241,6 +251,20 @@ class Track(ABC):
     def usable(self, state: TrackState, now: Tensor) -> Tensor:
         """``(*B,)`` bool: whether the track can be used at time ``now`` (*B,) [s]."""
         return (state.used >= self.least) & (now - state.time <= self.patience)
+
+    def _row(self, state: TrackState, measured: Measurement) -> Tensor | None:
+        """The motion of a single target after a measurement that is not late, or None if it does not fit."""
+        time, pos, variance = measured
+        found = updated_row(
+            state.motion.flatten().tolist(),
+            pos.flatten().tolist(),
+            time.item() - state.time.item(),
+            variance.item() if isinstance(variance, Tensor) else variance,
+            drift=self._drift,
+            forgets=self.forgets,
+            gate=self.gate,
+        )
+        return None if found is None else state.motion.new_tensor(found).view_as(state.motion)
 
     def _expect_next(self, state: TrackState, measured: Measurement) -> Prediction:
         """`_expect` for the common case that no row's measurement is late: fewer operations, the same result."""
@@ -502,6 +526,13 @@ def _is_in_order(before: Tensor, time: Tensor, now: Tensor) -> bool:
     if time.numel() != 1:
         return bool(((time >= before) & (time <= now + CLOCKS)).all())
     return before.item() <= time.item() <= now.item() + CLOCKS
+
+
+def _is_row(motion: Tensor, last: Tensor, measured: Measurement) -> bool:
+    """Whether there is one target, on the CPU and without derivatives, so that numbers do for tensors."""
+    if measured.time.numel() != 1 or not motion.is_cpu or motion.dtype != measured.pos.dtype:
+        return False
+    return not is_followed(motion, last, *(value for value in measured if isinstance(value, Tensor)))
 
 
 SIZES = {d * n + n * (n + 1) // 2: (d, n) for d in POINT_SIZES for n in (2, 3)}
