@@ -70,6 +70,14 @@ def test_velocity():
         agree(printed, expected, first)
 
 
+def test_ceiling():
+    ceilings, rows = {row["velocity"]: row for row in rows_of("ceiling.json")}, rows_in("velocity")
+    for first, printed in table("docs/results.md", "velocity | balls | ceiling"):
+        velocity = float(first.split()[0])
+        row, reached = ceilings[velocity], at(rows, "wait_and_drop", velocity=velocity)["success_solvable"]
+        agree(printed, [row["solvable"], row["ceiling"], *row["ceiling_ci"], reached / row["ceiling"]], first)
+
+
 def test_velocity_with_the_policy():
     rows, ik = rows_in("policy/velocity"), rows_in("velocity")
     for first, printed in table("docs/results.md", "velocity | solvable | target pursuit | corner | oracle"):
