@@ -28,7 +28,7 @@ TRACKS = {"ballistic": {}, "kalman": {"accelerates": True, "acceleration": 10.0}
 class Arguments(Episodes):
     """Catch balls."""
 
-    planners: tuple[str, ...] = ("meet", "pursuit", "oracle")
+    planners: tuple[str, ...] = ("meet", "learned", "pursuit", "oracle")
     """Planners of the task; the oracle knows the flight, whatever is measured."""
     sensors: tuple[str, ...] = ("3 mm, 60 Hz", "exact")
     """By name."""

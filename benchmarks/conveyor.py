@@ -26,7 +26,7 @@ SIDE_BY_SIDE = 100
 class Arguments(Output):
     """Take parts off a belt."""
 
-    planners: tuple[str, ...] = ("pursuit:gain", "pursuit", "meet")
+    planners: tuple[str, ...] = ("pursuit:gain", "pursuit", "meet", "learned")
     """Planners, each behind a colon with its static planner if that is not the task's first."""
     speeds: tuple[float, ...] = (0.2, 0.35, 0.6)
     """Speeds of the belt [m/s]."""

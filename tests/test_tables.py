@@ -263,6 +263,45 @@ def test_deviations():
         agree(printed, expected, first)
 
 
+def test_catch():
+    rows = rows_of("catch.json")
+    lines = table("docs/catch.md", "planner | sensor")
+    assert len(lines) == len(rows)
+    for first, printed in lines:
+        name = re.findall(r"\w+", first)[0]
+        sensor = "3 mm, 60 Hz" if printed[:2] == ["3", "60"] else "exact"
+        (row,) = (row for row in rows if (row["planner"], row["sensor"]) == (name, sensor))
+        measured = [3, 60] if sensor != "exact" else []
+        agree(printed, [*measured, row["success_solvable"], *row["success_solvable_ci"]], (name, sensor))
+
+
+def test_catch_of_other_balls():
+    rows = rows_of("catch.json") + rows_of("catch_drag.json")
+    for first, printed in table("docs/catch.md", "drag [1/m]"):
+        found = {
+            row["planner"]: row["success_solvable"]
+            for row in rows
+            if row["drag"] == float(first.split()[0]) and row["sensor"] == "3 mm, 60 Hz"
+        }
+        agree(printed, [found["meet"], found["learned"]], first)
+
+
+def test_conveyor():
+    rows = rows_of("conveyor.json")
+    lines = table("docs/conveyor.md", "planner | 0.2 m/s")
+    for planner, (first, printed) in zip(("pursuit:gain", "pursuit", "meet", "learned"), lines, strict=True):
+        expected = []
+        for speed in (0.2, 0.35, 0.6):
+            (row,) = (row for row in rows if (row["planner"], row["speed"]) == (planner, speed))
+            expected += [row["taken_of_solvable"], *([row["seconds_to_clear"]] if row["taken_of_solvable"] else [])]
+        agree(printed, expected, first)
+    several = rows_of("conveyor_parts.json")
+    for entry, (first, printed) in zip(
+        ("taken_of_solvable", "episodes_cleared"), table("docs/conveyor.md", "| 0.2 m/s"), strict=True
+    ):
+        agree(printed, [row[entry] for row in several], first)
+
+
 def test_a_number_that_is_off_is_found():
     agree(["93.1", ".45"], [93.0986, 0.4535], "good")
     with pytest.raises(AssertionError, match=r"93\.2"):

@@ -20,6 +20,8 @@ LARGEST = 10**18 - 1
 MOST_THREADS = 1024
 
 
+POSE_SIZE = 7
+"""Entries of a pose: a position and a quaternion wxyz."""
 POINT_SIZES = (2, 3)
 """Coordinates D of a point: x and y in a plane, or x, y and z in space."""
 

@@ -55,6 +55,29 @@ def test_the_planner_is_shown_goal_step_and_its_own_memory():
     assert "plan" not in seen[-1].keys()  # noqa: SIM118
 
 
+def test_a_pose_is_shown_as_one_and_reached_as_its_function_says():
+    seen, asked = [], []
+
+    def planner(td):
+        seen.append(td.clone())
+        return td.set("action", torch.zeros(3, 3))
+
+    def at_goal(joint_pos, goal):
+        asked.append((joint_pos, goal))
+        return goal[:, 3] > 0.5
+
+    runner = EnvRunner(planner, PointEnv(3), at_goal=at_goal)
+    runner._seen["joint_pos"] = torch.ones(3, 2)
+    poses = torch.cat([GOALS, torch.eye(4)[:3]], dim=-1)
+    assert runner.is_reached(poses).tolist() == [True, False, False]
+    assert torch.equal(asked[0][0], torch.ones(3, 2))
+    runner.step(poses)
+    assert torch.equal(seen[0]["goal_pose"], poses)
+    assert torch.equal(seen[0]["goal"], GOALS)
+    with pytest.raises(InputError, match="either a radius or at_goal"):
+        EnvRunner(planner, PointEnv(3), radius=0.02, at_goal=at_goal)
+
+
 def test_a_radius_that_is_none_is_refused():
     with pytest.raises(InputError, match="radius"):
         EnvRunner(ProportionalController(gain=1.0), PointEnv(), radius=-1.0)

@@ -154,6 +154,32 @@ def test_a_network_without_never_gives_it_no_chance_in_any_form(tmp_path):
     torch.testing.assert_close(restored(state.float(), goal.detach().float()), logits.float(), atol=1e-5, rtol=0)
 
 
+def test_of_a_pose_it_reads_the_orientation(tmp_path):
+    torch.manual_seed(0)
+    network = ETANetwork(hidden=16, turned=True).double().eval()
+    state, place = samples(5)
+    turn = torch.nn.functional.normalize(torch.randn(5, 4, dtype=torch.float64), dim=-1)
+    turn[0] = 0.0
+    pose = torch.cat([place, turn], dim=-1)
+    network.set_input_statistics(state, pose)
+    logits = network(state, pose)
+    torch.testing.assert_close(network(state, pose * pose.new_tensor([1.0] * 3 + [-1.0] * 4)), logits)
+    turned_otherwise = torch.cat([place, turn.roll(1, dims=-1)], dim=-1)
+    changed = (network(state, turned_otherwise) - logits).abs().amax(-1)
+    assert changed[0] == 0.0
+    assert changed[1:].min() > 1e-3
+    torch.testing.assert_close(network.for_inference()(state, pose), logits)
+    several = pose.unsqueeze(0).expand(5, 5, 7)
+    read = network.for_inference().from_state(state)(several, estimator="expectation")
+    torch.testing.assert_close(read.steps, network.arrival(state.unsqueeze(1), several, estimator="expectation").steps)
+    restored = ETANetwork.from_pretrained(network.save_pretrained(tmp_path))
+    torch.testing.assert_close(restored(state.float(), pose.float()), logits.float(), atol=1e-5, rtol=0)
+    with pytest.raises(InputError, match=r"goal.*7.*\(5, 3\)"):
+        network(state, place)
+    with pytest.raises(InputError, match="turned goals need"):
+        ETAConfig(robot_state_size=4, tool_slice=(0, 2), turned=True)
+
+
 def test_whether_there_is_never_is_a_yes_or_a_no():
     with pytest.raises(InputError, match="never must be True or False, got 1"):
         ETAConfig(never=1)

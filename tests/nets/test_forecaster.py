@@ -2,7 +2,7 @@ import pytest
 import torch
 
 from torchdyn_plan.errors import InputError
-from torchdyn_plan.nets import Forecaster, ForecasterConfig
+from torchdyn_plan.nets import Ballistic, Forecaster, ForecasterConfig
 from torchdyn_plan.nets.symmetry import octant, square_symmetries
 
 
@@ -77,6 +77,35 @@ def test_a_network_that_adds_nothing_goes_on_at_constant_velocity():
     torch.testing.assert_close(network(history)[..., :2], expected)
 
 
+@pytest.mark.parametrize("drag", [0.0, 0.05])
+def test_a_network_that_adds_nothing_flies_on_by_the_law(drag):
+    law = {"gravity": (0.0, 0.0, -9.81), "drag": drag, "control_step": 0.008}
+    network = Forecaster(horizon=20, hidden=16, **law).double()
+    network.head.weight.data.zero_()
+    history = histories(2, 3)
+    torch.testing.assert_close(network(history), Ballistic(horizon=20, **law).predict(history).path)
+
+
+def test_what_gravity_does_to_the_history_is_not_seen():
+    torch.manual_seed(0)
+    falling, floating = (
+        Forecaster(horizon=20, hidden=16, gravity=(0.0, 0.0, fall), control_step=0.01).double() for fall in (-9.81, 0.0)
+    )
+    floating.load_state_dict(falling.state_dict())
+    place, step = histories(2, 5)[..., -1, :].unsqueeze(-2)
+    ago = torch.arange(23.0, -1.0, -1.0, dtype=torch.float64).unsqueeze(-1)
+    straight = place - 0.1 * ago * step
+    # With the same last step, and half a padded history.
+    parabola = straight + 0.5 * 0.01**2 * torch.tensor([0.0, 0.0, -9.81]) * ago * (ago - 1.0)
+    straight[:, :12], parabola[:, :12] = straight[:, 12:13], parabola[:, 12:13]
+    added = [
+        network(history) - network.law.continued(history[:, -1], history[:, -1] - history[:, -2])
+        for network, history in ((falling, parabola), (floating, straight))
+    ]
+    torch.testing.assert_close(*added, atol=1e-6, rtol=1e-6)
+    assert added[0].std() > 1e-6
+
+
 def test_padding_is_seen_as_padding(network):
     history = histories(1)
     padded = torch.cat([history[:, 12:13].expand(-1, 12, -1), history[:, 12:]], dim=1)
@@ -111,7 +140,16 @@ def test_wrong_histories_are_named(history, message):
 
 @pytest.mark.parametrize(
     "settings",
-    [{"history": 1}, {"horizon": 0}, {"half_extent": -1.0}, {"square_symmetry": 1}, {"step_scale": float("nan")}],
+    [
+        {"history": 1},
+        {"horizon": 0},
+        {"half_extent": -1.0},
+        {"square_symmetry": 1},
+        {"step_scale": float("nan")},
+        {"gravity": (0.0, -9.81)},
+        {"gravity": (0.0, 0.0, -9.81), "half_extent": 0.7},
+        {"drag": -1.0},
+    ],
 )
 def test_wrong_settings_are_named(settings):
     with pytest.raises(InputError, match=next(iter(settings))):

@@ -12,6 +12,7 @@ FORECASTERS = [
     {"channels": 40, "convolutions": 2},
     {"history": 12, "convolutions": 4},
     {"history": 6},
+    {"history": 6, "gravity": (0.1, 0.0, -9.81), "drag": 0.05, "control_step": 0.008},
 ]
 
 

@@ -11,7 +11,7 @@ from tensordict import TensorDict, TensorDictBase
 from torch import Tensor
 
 from torchdyn_plan import keys
-from torchdyn_plan.checks import check_number, check_trailing_shape
+from torchdyn_plan.checks import POSE_SIZE, check_number, check_trailing_shape
 from torchdyn_plan.envs.moving_target import MovingTargetEnv
 from torchdyn_plan.errors import InputError
 
@@ -65,9 +65,11 @@ class ArmRunner(ABC):
         """Whether each robot is at ``goal`` (N, 3) [m, world]: ``(N,)`` bool."""
 
     def step(self, goal: Tensor) -> None:
-        """One control step of every robot towards ``goal`` (N, 3) [m, world]."""
-        entries = self._observed()
-        entries |= {keys.GOAL: goal, keys.DESIRED_GOAL: goal, keys.STEP_COUNT: self._steps}
+        """One control step of every robot towards ``goal`` (N, 3) [m, world], or towards a ``goal_pose`` (N, 7)."""
+        entries, place = self._observed(), goal
+        if goal.shape[-1] == POSE_SIZE:
+            entries[keys.GOAL_POSE], place = goal, goal[:, :3]
+        entries |= {keys.GOAL: place, keys.DESIRED_GOAL: place, keys.STEP_COUNT: self._steps}
         if self._memory is not None:
             entries[keys.PLAN] = self._memory
         result = self.planner(TensorDict(entries, batch_size=[self.num_envs]))
@@ -80,11 +82,30 @@ class EnvRunner(ArmRunner):
     """The robots of an environment, driven to goals in place of its targets; its episodes end for nobody."""
 
     def __init__(
-        self, planner: Callable[[TensorDictBase], TensorDictBase], env: MovingTargetEnv, *, radius: float
+        self,
+        planner: Callable[[TensorDictBase], TensorDictBase],
+        env: MovingTargetEnv,
+        *,
+        radius: float | None = None,
+        at_goal: Callable[[Tensor, Tensor], Tensor] | None = None,
     ) -> None:
-        """Drive the robots of ``env``; one whose tool is within ``radius`` of its goal has arrived [m]."""
-        check_number("radius", radius, minimum=0.0)
-        self.env, self.radius = env, radius
+        """Drive the robots of ``env``.
+
+        Args:
+            planner: static planner.
+            env: their environment.
+            radius: a robot whose tool is within it of its goal has arrived [m].
+            at_goal: says instead which robots have arrived, for goals that are poses: from the joints' positions (N, J)
+                and the goals (N, 7) to ``(N,)`` bool.
+
+        Raises:
+            InputError: the radius is no such number, or there are both or neither.
+        """
+        if (radius is None) == (at_goal is None):
+            raise InputError(f"EnvRunner needs either a radius or at_goal, got {radius!r} and {at_goal!r}")
+        if radius is not None:
+            check_number("radius", radius, minimum=0.0)
+        self.env, self.radius, self.at_goal = env, radius, at_goal
         super().__init__(planner, env.num_envs)
         self.reset()
 
@@ -104,7 +125,9 @@ class EnvRunner(ArmRunner):
         self._seen = self.env.step(entries)["next"]
 
     def is_reached(self, goal: Tensor) -> Tensor:
-        """Whether each tool is within the radius of ``goal`` (N, 3) [m, world]: ``(N,)`` bool."""
+        """Whether each tool is within the radius of ``goal`` (N, 3) [m, world], or as `at_goal` says: ``(N,)`` bool."""
+        if self.at_goal is not None:
+            return self.at_goal(self._seen[keys.JOINT_POS], goal)
         return (self._seen[keys.TOOL_POS] - goal).norm(dim=-1) <= self.radius
 
 

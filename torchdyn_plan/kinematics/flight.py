@@ -15,7 +15,7 @@ TINY = 1e-12
 
 
 def fly(
-    place: Tensor, velocity: Tensor, *, step: float, count: int, gravity: Sequence[float], drag: float = 0.0
+    place: Tensor, velocity: Tensor, *, step: float, count: int, gravity: Sequence[float], drag: float | Tensor = 0.0
 ) -> tuple[Tensor, Tensor]:
     """Positions and velocities ``(*B, count, D)`` [m, m/s] after ``step``, 2 ``step`` … [s]; differentiable.
 
@@ -29,7 +29,8 @@ def fly(
         step: time between two moments [s].
         count: of the moments.
         gravity: g, D numbers [m/s²].
-        drag: k, deceleration over speed squared [1/m]: ½ ρ C A / m of a ball with area A and mass m.
+        drag: k, deceleration over speed squared [1/m]: ½ ρ C A / m of a ball with area A and mass m; a number, or
+            ``(*B, 1)``.
     """
     steps = max(math.ceil(step * count / LONGEST - 1e-9), 1)
     length, falls = step * count / steps, place.new_tensor(gravity)
@@ -41,13 +42,13 @@ def fly(
     return _between(torch.stack(places, -2), torch.stack(velocities, -2), length, step, count)
 
 
-def braked(velocity: Tensor, gravity: Tensor, drag: float) -> Tensor:
+def braked(velocity: Tensor, gravity: Tensor, drag: float | Tensor) -> Tensor:
     """The acceleration g - k |v| v at ``velocity`` (*B, D), with g (D,): ``(*B, D)`` [m/s²]."""
     speed = velocity.square().sum(-1, keepdim=True).clamp_min(TINY).sqrt()
     return gravity - drag * speed * velocity
 
 
-def _advance(velocity: Tensor, length: float, gravity: Tensor, drag: float) -> tuple[Tensor, Tensor]:
+def _advance(velocity: Tensor, length: float, gravity: Tensor, drag: float | Tensor) -> tuple[Tensor, Tensor]:
     """What a step of ``length`` [s] adds to place and ``velocity`` (*B, D): Nyström's form, as places do not matter."""
     first = braked(velocity, gravity, drag)
     second = braked(velocity + 0.5 * length * first, gravity, drag)

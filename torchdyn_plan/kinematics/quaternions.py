@@ -54,6 +54,15 @@ def is_turned(quat: Tensor) -> Tensor:
     return quat.square().sum(-1) > SHORTEST**2
 
 
+def outer_axes(quat: Tensor) -> Tensor:
+    """First and third column of the rotation matrices of quaternions ``(*B, 4)``: ``(*B, 6)``, zeros for zeros.
+
+    Unlike a quaternion, whose sign is free, they are a continuous function of the rotation.
+    """
+    axes = quat_matrix(quat)[..., ::2].flatten(-2)
+    return torch.where(is_turned(quat).unsqueeze(-1), axes, 0.0)
+
+
 def matrix_quat(rotation: Tensor) -> Tensor:
     """Unit quaternions ``(*B, 4)`` of rotation matrices ``(*B, 3, 3)``, by the best conditioned of four formulas."""
     # Every row of this matrix is the quaternion, times four of its entries.

@@ -131,18 +131,29 @@ class Ballistic(AnalyticForecast):
 
     def follow(self, history: Tensor, velocity: Tensor, time: Tensor, deviation: Tensor) -> Forecast:
         """As of `AnalyticForecast`."""
-        if len(self.gravity) != history.shape[-1]:
-            raise InputError(f"gravity has {len(self.gravity)} numbers, but targets {history.shape[-1]} coordinates")
+        path = self.fly_on(history[..., -1, :], velocity, time)
+        return Forecast(path, normal_spread(deviation.unsqueeze(-1).expand(*deviation.shape, 2)))
+
+    def fly_on(self, place: Tensor, velocity: Tensor, time: Tensor) -> Tensor:
+        """Positions ``(*B, F, D)`` at times ``time`` (F,) from now [s].
+
+        ``place`` (*B, D) is the position now [m, world], ``velocity`` (*B, D) that over the last control step [m/s].
+        """
+        if len(self.gravity) != place.shape[-1]:
+            raise InputError(f"gravity has {len(self.gravity)} numbers, but targets {place.shape[-1]} coordinates")
         falls = time.new_tensor(self.gravity)
         # The mean velocity over the last step is that of half a step ago.
         if self.drag:
             now = velocity + 0.5 * self.control_step * braked(velocity, falls, self.drag)
             law: dict[str, Any] = {"gravity": self.gravity, "drag": self.drag}
-            path, _ = fly(history[..., -1, :], now, step=self.control_step, count=len(time), **law)
-        else:
-            moment, speed = time.unsqueeze(-1), velocity + 0.5 * self.control_step * falls
-            path = history[..., -1:, :] + moment * speed.unsqueeze(-2) + 0.5 * moment.square() * falls
-        return Forecast(path, normal_spread(deviation.unsqueeze(-1).expand(*deviation.shape, 2)))
+            return fly(place, now, step=self.control_step, count=len(time), **law)[0]
+        moment, speed = time.unsqueeze(-1), velocity + 0.5 * self.control_step * falls
+        return place.unsqueeze(-2) + moment * speed.unsqueeze(-2) + 0.5 * moment.square() * falls
+
+    def continued(self, place: Tensor, step: Tensor) -> Tensor:
+        """Positions ``(*B, F, D)`` of targets that made their last ``step`` (*B, D) to ``place`` (*B, D) [m, world]."""
+        time = self.control_step * torch.arange(1, self.horizon + 1, dtype=place.dtype, device=place.device)
+        return self.fly_on(place, step / self.control_step, time)
 
     def part_settings(self) -> dict[str, Any]:
         """Constructor arguments of this model."""

@@ -8,8 +8,9 @@ from typing import TYPE_CHECKING, Any
 import torch
 from torch import Tensor, nn
 
-from torchdyn_plan.checks import POINT_SIZES, check_choice, check_number, network_input
+from torchdyn_plan.checks import POINT_SIZES, POSE_SIZE, check_choice, check_number, network_input
 from torchdyn_plan.errors import InputError
+from torchdyn_plan.kinematics.quaternions import outer_axes
 from torchdyn_plan.nets.arrival import ArrivalModel
 from torchdyn_plan.nets.distributions import ESTIMATORS, Arrival, without_never
 from torchdyn_plan.nets.pretrained import Pretrained
@@ -36,30 +37,40 @@ class ETAConfig:
     """Control steps in a bin."""
     hidden: int = 192
     """Width of the three hidden layers."""
+    turned: bool = False
+    """Whether goals are poses: a position and the tool's quaternion wxyz, as in ``goal_pose``."""
 
     def __post_init__(self) -> None:
         for name in ("robot_state_size", "bins", "bin_width", "hidden"):
             check_number(name, getattr(self, name), minimum=1, integer=True)
-        if not isinstance(self.never, bool):
-            raise InputError(f"never must be True or False, got {self.never!r}")
+        for name in ("never", "turned"):
+            if not isinstance(getattr(self, name), bool):
+                raise InputError(f"{name} must be True or False, got {getattr(self, name)!r}")
         object.__setattr__(self, "tool_slice", tuple(self.tool_slice))
         first, last = self.tool_slice
         if not 0 <= first < last <= self.robot_state_size or last - first not in POINT_SIZES:
             spans = f"2 or 3 entries of a robot state of {self.robot_state_size}"
             raise InputError(f"tool_slice must span {spans}, got {self.tool_slice}")
+        if self.turned and self.coordinates != 3:
+            raise InputError(f"turned goals need a tool position of 3 coordinates, got tool_slice = {self.tool_slice}")
 
     @property
     def coordinates(self) -> int:
         """Coordinates D of goals, equal to those of the tool position."""
         return self.tool_slice[1] - self.tool_slice[0]
 
+    @property
+    def goal_size(self) -> int:
+        """Entries of a goal: its coordinates, or 7 for poses."""
+        return POSE_SIZE if self.turned else self.coordinates
+
 
 class ETANetwork(Pretrained, Precise, ArrivalModel):
     """Estimated time of arrival P_ETA^R (paper, Section III-B.3): robot state and goal to a distribution over time.
 
     Three hidden linear + ReLU layers and a linear one. Features of the state enter the first layer separately from
-    those of the goal (its position, its offset and distance from the tool), so many goals share one state's work.
-    Inputs are standardised by buffers that `set_input_statistics` fills from training data.
+    those of the goal (its position, its offset and distance from the tool, and two axes of a pose), so many goals share
+    one state's work. Inputs are standardised by buffers that `set_input_statistics` fills from training data.
     """
 
     kind = "eta"
@@ -74,6 +85,7 @@ class ETANetwork(Pretrained, Precise, ArrivalModel):
         super().__init__()
         self.config = config = config or ETAConfig(**settings)
         size, hidden, wide = config.robot_state_size, config.hidden, 2 * config.coordinates + 2
+        wide += 6 * config.turned
         self.state_in = nn.Linear(size, hidden)
         self.goal_in = nn.Linear(wide, hidden, bias=False)
         self.second = nn.Linear(hidden, hidden)
@@ -85,7 +97,7 @@ class ETANetwork(Pretrained, Precise, ArrivalModel):
 
     @torch.no_grad()
     def set_input_statistics(self, robot_state: Tensor, goal: Tensor) -> None:
-        """Standardise inputs by mean and deviation of the samples ``robot_state (n, S)`` and ``goal (n, 3)``."""
+        """Standardise inputs by mean and deviation of the samples ``robot_state (n, S)`` and ``goal (n, D)``."""
         features = self._goal_features(robot_state, goal)
         for name, values in (("state", robot_state), ("goal", features)):
             scale = 1.0 / values.std(dim=0).clamp(min=1e-3)
@@ -98,7 +110,7 @@ class ETANetwork(Pretrained, Precise, ArrivalModel):
         Args:
             robot_state: ``(*B, S)``; its batch broadcasts against the goal's, ``(*B, 1, S)`` with ``(*B, K, D)``
                 serves K goals from one state.
-            goal: ``(*B, D)`` goals [m, world].
+            goal: ``(*B, D)`` goals [m, world]; ``(*B, 7)`` if they are ``turned``.
 
         Returns:
             ``(*B, bins + 1)`` logits, of the goals' type.
@@ -110,7 +122,7 @@ class ETANetwork(Pretrained, Precise, ArrivalModel):
             return without_autocast(self.forward, robot_state, goal)
         about: Any = {"like": self.state_scale, "owner": type(self).__name__}
         seen = network_input("robot_state", robot_state, self.config.robot_state_size, **about)
-        place, stored = network_input("goal", goal, self.config.coordinates, **about), self.head.weight.dtype
+        place, stored = network_input("goal", goal, self.config.goal_size, **about), self.head.weight.dtype
         state = torch.addcmul(self.state_shift, seen, self.state_scale)
         target = torch.addcmul(self.goal_shift, self._goal_features(seen, place), self.goal_scale)
         if state.dtype != stored:
@@ -143,12 +155,16 @@ class ETANetwork(Pretrained, Precise, ArrivalModel):
         return InferenceETA(self)
 
     def _goal_features(self, robot_state: Tensor, goal: Tensor) -> Tensor:
-        """Goal, its offset from the tool, level and full distance: ``(*B, 2D + 2)``."""
+        """Goal, its offset from the tool, level and full distance, and the axes of a pose: ``(*B, 2D + 2 or 14)``."""
         first, last = self.config.tool_slice
-        offset = goal - robot_state[..., first:last]
+        place = goal[..., : last - first]
+        offset = place - robot_state[..., first:last]
         level = torch.linalg.vector_norm(offset[..., :2], dim=-1, keepdim=True)
         full = torch.linalg.vector_norm(offset, dim=-1, keepdim=True)
-        return torch.cat([goal.expand(offset.shape), offset, level, full], dim=-1)
+        features = [place.expand(offset.shape), offset, level, full]
+        if self.config.turned:
+            features.append(outer_axes(goal[..., 3:]).expand(*offset.shape[:-1], 6))
+        return torch.cat(features, dim=-1)
 
 
 def arrival_classes(arrival: Tensor, *, bins: int = 100, bin_width: int = 5) -> tuple[Tensor, Tensor]:

@@ -10,8 +10,9 @@ import torch
 from torch import Tensor, nn
 
 from torchdyn_plan import keys
-from torchdyn_plan.checks import check_count, check_number, check_trailing_shape, network_input
+from torchdyn_plan.checks import check_count, check_number, check_trailing_shape, check_vector, network_input
 from torchdyn_plan.errors import InputError
+from torchdyn_plan.nets.analytic import Ballistic
 from torchdyn_plan.nets.forecast import DescribedForecast, in_plane
 from torchdyn_plan.nets.pretrained import Pretrained
 from torchdyn_plan.nets.reflection import reflect
@@ -54,6 +55,13 @@ class ForecasterConfig:
     """Stride at which the history is read, including the newest position."""
     tracked: bool = False
     """Whether it also reads the covariance of position and velocity from a `torchdyn_plan.planners.Track`."""
+    gravity: tuple[float, float, float] | None = None
+    """Acceleration of a target that flies [m/s², world]. The network then learns what a `Ballistic` forecast leaves
+    out, in units of ``change_scale`` for each step. None for a target that does not fall."""
+    drag: float = 0.0
+    """Of that `Ballistic` forecast: deceleration over speed squared [1/m]."""
+    control_step: float = 0.004
+    """Time between two positions, for that forecast [s]."""
 
     def __post_init__(self) -> None:
         check_number("history", self.history, minimum=2, integer=True)
@@ -70,6 +78,16 @@ class ForecasterConfig:
         for name in ("square_symmetry", "tracked"):
             if not isinstance(getattr(self, name), bool):
                 raise InputError(f"{name} must be a bool, got {getattr(self, name)!r}")
+        check_number("drag", self.drag, minimum=0.0)
+        check_number("control_step", self.control_step, minimum=1e-6)
+        if self.gravity is None:
+            return
+        object.__setattr__(self, "gravity", check_vector("gravity", self.gravity))
+        if len(self.gravity) != 3 or self.half_extent is not None or self.square_symmetry or self.stride > 1:
+            raise InputError(
+                "gravity is three numbers, for a network without half_extent, square_symmetry and stride, got "
+                f"{self.gravity!r}"
+            )
 
 
 class Forecaster(Pretrained, Precise, DescribedForecast):
@@ -77,7 +95,8 @@ class Forecaster(Pretrained, Precise, DescribedForecast):
 
     Displacements are embedded step by step, convolved over the history, concatenated with the newest position and step,
     and mapped by one linear head to all F positions, as deviations from constant velocity. On a table with cushions it
-    forecasts a line that runs on through them, and then reflects it (`torchdyn_plan.nets.reflection`).
+    forecasts a line that runs on through them, and then reflects it (`torchdyn_plan.nets.reflection`). With a
+    ``gravity`` the deviations are from a ballistic flight, and displacements are seen as if nothing fell.
     """
 
     kind = "forecaster"
@@ -88,6 +107,7 @@ class Forecaster(Pretrained, Precise, DescribedForecast):
     present_feature_scale: Tensor
     step_factor: Tensor
     departure_scale: Tensor
+    fallen: Tensor
 
     def __init__(self, config: ForecasterConfig | None = None, **settings: Any) -> None:
         """Build the network from ``config``, or from the fields of `ForecasterConfig` given as keywords."""
@@ -114,7 +134,16 @@ class Forecaster(Pretrained, Precise, DescribedForecast):
         self.head.weight.data.mul_(0.1)
         steps = torch.arange(1.0, config.horizon + 1.0)
         level, height = config.step_scale * steps, torch.full_like(steps, config.height_scale)
-        constants = {
+        constants: dict[str, Tensor] = {}
+        self.law = None
+        if config.gravity is not None:
+            law: dict[str, Any] = {"control_step": config.control_step, "gravity": config.gravity, "drag": config.drag}
+            self.law = Ballistic(horizon=config.horizon, **law)
+            level = height = 0.5 * config.change_scale * steps.square()
+            # What gravity has added to a step from then to now.
+            ago = torch.arange(config.history - 2.0, -1.0, -1.0).unsqueeze(-1)
+            constants["fallen"] = config.control_step**2 * ago * torch.tensor(config.gravity)
+        constants |= {
             "symmetries": square_symmetries(),
             "steps_ahead": steps,
             "step_feature_scale": torch.tensor([*step, 0.2, 0.2, 0.2, 1.0]),
@@ -216,12 +245,17 @@ class Forecaster(Pretrained, Precise, DescribedForecast):
         departure = self.head(self.mix(hidden)).view(-1, 3, self.config.horizon)
         if departure.dtype != now.dtype:
             departure = departure.to(now.dtype)
-        straight = torch.addcmul(now.unsqueeze(-1), newest.unsqueeze(-1), self.step_factor)
-        return torch.addcmul(straight, departure, self.departure_scale), hidden
+        if self.law is None:
+            expected = torch.addcmul(now.unsqueeze(-1), newest.unsqueeze(-1), self.step_factor)
+        else:
+            expected = self.law.continued(now, newest).mT
+        return torch.addcmul(expected, departure, self.departure_scale), hidden
 
     def _step_features(self, step: Tensor) -> Tensor:
         """Each step, its difference from the newest one, and whether it is not padding, ``(R, H-1, 7)``."""
         real = (step != 0).any(dim=-1, keepdim=True)
+        if self.law is not None:
+            step = torch.addcmul(step, real.to(step.dtype), self.fallen)
         # Braking changes a step by a thousandth of it, a bounce by twice: a logarithm resolves both.
         change = torch.asinh((step - step[:, -1:]) * (real / self.config.change_scale))
         return torch.cat([step, change, real.to(step.dtype)], dim=-1) * self.step_feature_scale

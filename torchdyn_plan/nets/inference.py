@@ -17,6 +17,7 @@ from torch import Tensor, nn
 from torch.func import debug_unwrap
 
 from torchdyn_plan.checks import check_choice, network_input
+from torchdyn_plan.kinematics.quaternions import outer_axes
 from torchdyn_plan.nets.arrival import ArrivalModel, ArrivalQuery
 from torchdyn_plan.nets.capture import CaptureModel
 from torchdyn_plan.nets.distributions import ESTIMATORS, Arrival, Spread, arrival_moments, without_never
@@ -93,6 +94,7 @@ class InferenceForecaster(Precise, DescribedForecast):
     """
 
     zero: Tensor
+    fallen: Tensor
     turns: Tensor
     octants: Tensor
     embed_weight: Tensor
@@ -118,8 +120,11 @@ class InferenceForecaster(Precise, DescribedForecast):
         self.config = config = network.config
         self.history, self.in_keys, self.samples = config.history, network.in_keys, network.samples
         self.judged = spread is not None
+        self.law = network.law
         dtype, exact = network.head.weight.dtype, copy.deepcopy(network).double()
         hold_constants(self, dtype, turns=_turns(exact), octants=_octants(exact))
+        if self.law is not None:
+            hold_constants(self, dtype, fallen=exact.fallen)
         embed: Any = exact.embed
         weight = embed.weight.squeeze(-1) * exact.step_feature_scale
         hold_constants(self, dtype, embed_weight=weight.mT, embed_bias=embed.bias, zero=torch.zeros(1))
@@ -236,6 +241,8 @@ class InferenceForecaster(Precise, DescribedForecast):
     def _line(self, step: Tensor, now: Tensor, newest: Tensor, *known: Tensor) -> tuple[Tensor, Tensor]:
         """Unreflected line (R, 3, F) and hidden features; with cushions x and y count in periods of the reflection."""
         real = step.any(dim=-1, keepdim=True).to(step.dtype)
+        if self.law is not None:
+            step = torch.addcmul(step, real, self.fallen)
         change = torch.addcmul(self.zero, step - step[:, -1:], real, value=1.0 / self.config.change_scale).asinh()
         features = torch.cat([step, change, real], dim=-1).view(-1, 7)
         features = torch.addmm(self.embed_bias, features, self.embed_weight).relu_()
@@ -254,6 +261,8 @@ class InferenceForecaster(Precise, DescribedForecast):
         mixed = torch.addmm(self.mix_bias, hidden, self.mix_weight)
         mixed = torch.cat([mixed, now, newest], dim=-1)
         line = torch.addmm(self.head_bias, mixed, self.head_weight).view(len(step), 3, self.config.horizon)
+        if self.law is not None:
+            line = line + self.law.continued(now, newest).mT
         return line, hidden
 
     def _ahead(self, now: Tensor, newest: Tensor) -> tuple[Tensor, ...]:
@@ -291,12 +300,13 @@ class InferenceETA(Precise, ArrivalModel):
         super().__init__()
         self.config = config = network.config
         dtype, exact, size = network.head.weight.dtype, copy.deepcopy(network).double(), config.coordinates
-        goal, offset, lengths = (exact.goal_in.weight * exact.goal_scale).split([size, size, 2], dim=1)
+        parts = [size, size, 2, 6 * config.turned]
+        goal, offset, lengths, axes = (exact.goal_in.weight * exact.goal_scale).split(parts, dim=1)
         bias = exact.state_in.bias + exact.state_in.weight @ exact.state_shift + exact.goal_in.weight @ exact.goal_shift
         state = (exact.state_in.weight * exact.state_scale).clone()
         state[:, slice(*config.tool_slice)] -= offset
         hold_constants(self, dtype, state_weight=state.mT, state_bias=bias)
-        hold_constants(self, dtype, goal_weight=torch.cat([goal + offset, lengths], dim=1).mT)
+        hold_constants(self, dtype, goal_weight=torch.cat([goal + offset, lengths, axes], dim=1).mT)
         for name in ("second", "third", "head"):
             layer = getattr(exact, name)
             hold_constants(self, dtype, **{f"{name}_weight": layer.weight.mT, f"{name}_bias": layer.bias})
@@ -326,7 +336,7 @@ class InferenceETA(Precise, ArrivalModel):
 
     def _check(self, robot_state: Tensor, goal: Tensor) -> None:
         """Raise `InputError` for an input that is none."""
-        network_input("goal", goal, self.config.coordinates, like=self.head_weight)
+        network_input("goal", goal, self.config.goal_size, like=self.head_weight)
         network_input("robot_state", robot_state, self.config.robot_state_size, like=self.head_weight)
 
     def _share(self, robot_state: Tensor) -> tuple[Tensor, Tensor]:
@@ -352,11 +362,15 @@ class InferenceETA(Precise, ArrivalModel):
         return ESTIMATORS[estimator](scores, bin_width=width)
 
     def scores(self, tool_pos: Tensor, state: Tensor, goal: Tensor) -> Tensor:
-        """Scores ``(*B, bins + 1)`` for tools (*B, 3), the states' share of the first layer, and goals (*B, 3)."""
+        """Scores ``(*B, bins + 1)`` for tools (*B, 3), the states' share of the first layer, and goals (*B, 3 or 7)."""
         goal = goal if goal.dtype == state.dtype else goal.to(state.dtype)
-        offset = goal - tool_pos
+        place = goal[..., :3] if self.config.turned else goal
+        offset = place - tool_pos
         lengths = (offset.square() @ self.square_sums).sqrt_()
-        hidden = (torch.cat([goal.expand(offset.shape), lengths], dim=-1) @ self.goal_weight).add_(state).relu_()
+        seen = [place.expand(offset.shape), lengths]
+        if self.config.turned:
+            seen.append(outer_axes(goal[..., 3:]).expand(*offset.shape[:-1], 6))
+        hidden = (torch.cat(seen, dim=-1) @ self.goal_weight).add_(state).relu_()
         rows = torch.addmm(self.second_bias, hidden.view(-1, self.config.hidden), self.second_weight).relu_()
         rows = torch.addmm(self.third_bias, rows, self.third_weight).relu_()
         rows = torch.addmm(self.head_bias, rows, self.head_weight)
@@ -466,6 +480,9 @@ def _head(network: Forecaster) -> tuple[Tensor, Tensor]:
     now = eye.expand(3, horizon, 3)
     newest = eye * network.step_factor.unsqueeze(-1)
     whole = torch.cat([weight.view(3, horizon, -1), now, newest], dim=-1)
+    if network.law is not None:
+        # The law says where the target is expected.
+        whole[..., -6:] = 0.0
     if extent is not None:
         unit[:2] = 0.25 / extent
         bias[:2] -= extent

@@ -314,15 +314,18 @@ class PlannerParts:
         """`spread_forecaster`, together with the one for noisy measurements if there is one."""
         from torchdyn_plan.nets import ForecastByNoise, Forecaster, SpreadForecaster, SpreadNetwork
 
-        if self.weights is None:
-            names = [f"{self._path_weights}-noisy"] * 2
-        else:
-            names = [self.weights / f"{NOISY}{kind}" for kind in ("forecaster", "spread")]
-            if not all(folder.is_dir() for folder in names):
-                return self.spread_forecaster
-        forecaster = Forecaster.from_pretrained(names[0]).requires_grad_(False)
-        spread = SpreadNetwork.from_pretrained(names[1]).requires_grad_(False)
+        forecaster, spread = self._noisy(Forecaster), self._noisy(SpreadNetwork)
+        if forecaster is None or spread is None:
+            return self.spread_forecaster
         return ForecastByNoise(self.spread_forecaster, SpreadForecaster(forecaster, spread)).eval()
+
+    @property
+    def path_by_noise(self) -> Any:
+        """`forecaster`, together with the one for noisy measurements if there is one: paths without a spread."""
+        from torchdyn_plan.nets import ForecastByNoise, Forecaster
+
+        noisy = self._noisy(Forecaster)
+        return self.forecaster if noisy is None else ForecastByNoise(self.forecaster, noisy).eval()
 
     @property
     def eta(self) -> Any:
@@ -356,6 +359,15 @@ class PlannerParts:
     @property
     def _path_weights(self) -> str:
         return self.task.path_weights or self.task.weights_name
+
+    def _noisy(self, kind: Any) -> Any:
+        """The network of that kind for noisy measurements, frozen; None if the folder has none."""
+        name: Any = f"{self._path_weights}-noisy"
+        if self.weights is not None:
+            name = self.weights / f"{NOISY}{kind.kind}"
+            if not name.is_dir():
+                return None
+        return kind.from_pretrained(name).requires_grad_(False)
 
     def _load(self, kind: Any, name: str) -> Any:
         return kind.from_pretrained(name if self.weights is None else self.weights).requires_grad_(False)

@@ -6,7 +6,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from torchdyn_plan.checks import check_finite, check_points, check_trailing_shape
+from torchdyn_plan.checks import POSE_SIZE, check_finite, check_points, check_trailing_shape
 from torchdyn_plan.errors import InputError
 from torchdyn_plan.training.shards import read_shards
 
@@ -17,7 +17,7 @@ class Arrivals(NamedTuple):
     robot_state: Tensor
     """(n, S), the input of the ETA network."""
     goal: Tensor
-    """(n, 3) [m, world]."""
+    """(n, 3) [m, world]; (n, 7) for poses, like ``goal_pose``."""
     arrival: Tensor
     """(n,) int64 control steps until the goal was reached, -1 for never."""
     nearest: Tensor
@@ -38,7 +38,7 @@ def load_arrivals(folder: Path, *, state_size: int | None = None) -> Arrivals:
     """
     shards = read_shards(folder, "arrivals", Arrivals._fields)
     data = Arrivals(*(torch.cat([shard[name] for shard in shards]) for name in Arrivals._fields))
-    check_points("goal", data.goal)
+    check_points("goal", data.goal[..., :3] if data.goal.shape[-1] == POSE_SIZE else data.goal)
     for name, least in (("arrival", -1), ("nearest", 0), ("run", None)):
         values = getattr(data, name)
         if values.dtype != torch.int64 or (least is not None and bool((values < least).any())):

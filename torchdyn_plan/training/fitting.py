@@ -76,8 +76,9 @@ class Fitting:
     """Makes further windows on which a spread is scored."""
 
     def recipe(self, network: str) -> Recipe:
-        """How the network of that name is fitted."""
-        return self.recipes.get(network, RECIPES[network.removeprefix(NOISY)])
+        """How the network of that name is fitted; one for noisy measurements like the other of its kind."""
+        kind = network.removeprefix(NOISY)
+        return self.recipes.get(kind, RECIPES[kind])
 
     def __post_init__(self) -> None:
         for network in self.recipes:

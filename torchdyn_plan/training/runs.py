@@ -35,11 +35,11 @@ class Runner(Protocol):
         ...
 
     def is_reached(self, goal: Tensor) -> Tensor:
-        """Whether each robot is at ``goal`` (N, 3) [m, world]: ``(N,)`` bool."""
+        """Whether each robot is at ``goal`` (N, 3) [m, world], or at a pose (N, 7): ``(N,)`` bool."""
         ...
 
     def step(self, goal: Tensor) -> None:
-        """One control step of every robot towards ``goal`` (N, 3) [m, world]."""
+        """One control step of every robot towards ``goal`` (N, 3) [m, world], or towards a pose (N, 7)."""
         ...
 
 
@@ -48,7 +48,7 @@ class RunPlan:
     """How runs follow one another; times are control steps."""
 
     goals: Callable[[int, torch.Generator], Tensor]
-    """Draws the given number of goals, ``(count, 3)`` [m, world]."""
+    """Draws the given number of goals, ``(count, 3)`` [m, world], or ``(count, 7)`` for poses like ``goal_pose``."""
     sequence: int
     """Length of a sequence of runs, which begins at the start pose."""
     longest: int
@@ -95,7 +95,7 @@ def record_sequence(runner: Runner, plan: RunPlan, draw: torch.Generator) -> dic
         draw: source of goals, redirections and sampled states.
 
     Returns:
-        n samples, ``plan.states`` of each run, the first at its start: ``robot_state`` (n, S), ``goal`` (n, 3)
+        n samples, ``plan.states`` of each run, the first at its start: ``robot_state`` (n, S), ``goal`` (n, 3 or 7)
         [m, world], ``arrival`` (n,) control steps from the state to the goal or -1 for never, ``nearest`` (n,) control
         steps until the tool was nearest to the goal, ``run`` (n,) numbers.
     """
@@ -119,7 +119,8 @@ def record_sequence(runner: Runner, plan: RunPlan, draw: torch.Generator) -> dic
         if len(rows):
             teaches = rows[(arrived | still | (given_up & (not plan.comes_to_rest)))[rows]]
             taken = given[teaches].unsqueeze(-1) + _within(step - given[teaches], plan.states, draw)
-            nearest = first_as_near(tools[: step + 1, teaches], goal[teaches], given[teaches])
+            place = goal[teaches, : tools.shape[-1]]
+            nearest = first_as_near(tools[: step + 1, teaches], place, given[teaches])
             nearest = torch.where(arrived[teaches], step, nearest)
             samples.append(
                 {

@@ -18,12 +18,13 @@ FEWEST = 20
 
 
 def draw_throws(
-    scene: CatchScene, episodes: Tensor, *, flight: float, drag: float, split: str, seed: int
+    scene: CatchScene, episodes: Tensor, *, flight: float | Tensor, drag: float | Tensor, split: str, seed: int
 ) -> tuple[Tensor, Tensor]:
     """Where the balls of ``episodes`` (M,) start, and how fast: ``(M, 3)`` each [m, m/s, world], float64.
 
     All of it is uniform: distance, direction and height of the start, the place that is aimed at, and the time of
-    flight to there, ``flight`` [s] in the mean. ``drag`` is the ball's [1/m]: who throws knows it.
+    flight to there, ``flight`` [s] in the mean. ``drag`` is the ball's [1/m]: who throws knows it. Both are numbers, or
+    one for each ball, flights ``(M,)`` and drags ``(M, 1)``.
     """
     share = 0.5 + 0.5 * draw_uniform(episodes, 7, split=split, seed=seed)
     distance = scene.throw_from + share[:, 0] * (scene.throw_to - scene.throw_from)
@@ -37,14 +38,15 @@ def draw_throws(
     return start, velocity_through(start, aim, steps, step=scene.control_step, drag=drag)
 
 
-def velocity_through(start: Tensor, aim: Tensor, steps: Tensor, *, step: float, drag: float) -> Tensor:
+def velocity_through(start: Tensor, aim: Tensor, steps: Tensor, *, step: float, drag: float | Tensor) -> Tensor:
     """Velocity (M, 3) [m/s] by which a ball from ``start`` (M, 3) is at ``aim`` (M, 3) [m] after ``steps`` (M,).
 
     It is that of the parabola, corrected a few times by what the ball misses. ``step`` is the time of one [s].
     """
     time = (step * steps).unsqueeze(-1)
     velocity = (aim - start) / time - 0.5 * time * start.new_tensor(GRAVITY)
-    for _ in range(CORRECTIONS if drag else 0):
+    # Without drag the parabola is exact.
+    for _ in range(CORRECTIONS if isinstance(drag, Tensor) or drag else 0):
         path, _ = fly(start, velocity, step=step, count=int(steps.max()), gravity=GRAVITY, drag=drag)
         met = path.gather(-2, (steps - 1).view(-1, 1, 1).expand(-1, 1, 3)).squeeze(-2)
         velocity = velocity + (aim - met) / time

@@ -240,13 +240,18 @@ class IKPlanner(Precise, StaticPlannerModule):
             rows = self._rows(pose, jacobian, error.shape[-1])
             step = limited_step(dls_step(rows, error, GOAL_DAMPING), longest, 1.0)
             q = torch.clamp(q + step, self.arm.lower, self.arm.upper)
-        way = self._way(self.arm(q), goal)
-        left = way[..., :3].norm(dim=-1)
         outside = (self.approach.within_reach(goal) - goal).norm(dim=-1)
-        reached = (left <= GOAL_TOLERANCE) & (outside <= GOAL_TOLERANCE)
-        if self.goal_size == 7:
-            reached = reached & (way[..., 3:].norm(dim=-1) <= TURN_TOLERANCE)
+        reached = self.is_at(q, goal) & (outside <= GOAL_TOLERANCE)
         return q.view(*batch, -1), reached.view(batch)
+
+    def is_at(self, joint_pos: Tensor, goal: Tensor) -> Tensor:
+        """Whether the tool is at ``goal`` (R, 3) [m, world] at joint angles (R, N) [rad]: ``(R,)`` bool.
+
+        That is within `GOAL_TOLERANCE`, and for poses (R, 7) also within `TURN_TOLERANCE`.
+        """
+        way = self._way(self.arm(joint_pos), goal)
+        there = way[..., :3].norm(dim=-1) <= GOAL_TOLERANCE
+        return there if self.goal_size == 3 else there & (way[..., 3:].norm(dim=-1) <= TURN_TOLERANCE)
 
     def _way(self, pose: Tensor, goal: Tensor) -> Tensor:
         """The remaining twist from poses (R, 4, 4) to goals (R, 3 or 7)."""

@@ -74,13 +74,14 @@ def forecaster() -> Any:
     return Ballistic(horizon=HORIZON, control_step=scene().control_step, drag=DRAG)
 
 
-def dynamic(parts: PlannerParts, forecaster: Any) -> Any:
-    """The planner on that forecast."""
+def dynamic(parts: PlannerParts, forecaster: Any, eta: Any = None) -> Any:
+    """The planner on that forecast, by those arrival times; by the joints' limits for None."""
     from torchdyn_plan.planners import AgainstVelocity, DynamicPlanner, ExactSearch, GoAndStay, ReplanSchedule
 
     return DynamicPlanner(
         parts.static,
         forecaster,
+        eta,
         search=ExactSearch(stride=2, first=2, margin=10.0, switching_cost=0.1),
         schedule=ReplanSchedule.every(6),
         maneuver=GoAndStay(before=3, within=0.12),
@@ -93,6 +94,11 @@ def dynamic(parts: PlannerParts, forecaster: Any) -> Any:
 def meet(parts: PlannerParts) -> Any:
     """Holds the cup where the ball will come, against its velocity; nothing of it is trained."""
     return dynamic(parts, forecaster())
+
+
+def learned(parts: PlannerParts) -> Any:
+    """The same with trained networks: of what a tennis ball's flight leaves out, and of arrival times."""
+    return dynamic(parts, parts.path_by_noise, parts.eta)
 
 
 def oracle(parts: PlannerParts) -> Any:
@@ -124,6 +130,27 @@ def judge(settings: CatchSettings, log: Any, truth: Truth) -> Verdict:
     return Verdict(cause, {}, {})
 
 
+def record_paths(blocks: Any, **how: Any) -> dict[str, Any]:
+    """As `Task.record_paths` says: flights that nothing interrupts."""
+    from torchdyn_plan.tasks.catch.data import record_flights
+
+    return record_flights(blocks, **how)
+
+
+def record_arrivals(planner: Any, **how: Any) -> dict[str, Any]:
+    """As `Task.record_arrivals` says: the cup sent to places on flights, turned against the ball."""
+    from torchdyn_plan.tasks.catch.data import record_arm_runs
+
+    return record_arm_runs(planner, **how)
+
+
+def fitting() -> Any:
+    """Sizes of its networks, and how they are scored."""
+    from torchdyn_plan.tasks.catch.data import catch_fitting
+
+    return catch_fitting()
+
+
 TASK = Task(
     name="catch",
     summary="A UR10 with a cup meets a thrown ball in the air.",
@@ -134,9 +161,13 @@ TASK = Task(
     make_env=make_env,
     digest=lambda: scene().digest(),
     static_planners={"ik": ik},
-    planners={"pursuit": pursuit, "meet": meet, "oracle": oracle},
+    planners={"pursuit": pursuit, "meet": meet, "oracle": oracle, "learned": learned},
+    rivals=("learned",),
     rows_at_once=(32, 64),
     truth=truth,
     causes=("out of reach", "missed"),
     judge=judge,
+    record_paths=record_paths,
+    record_arrivals=record_arrivals,
+    fitting=fitting,
 )

@@ -1,4 +1,4 @@
-"""Conveyor: a Panda picks parts off a moving belt, with nothing trained."""
+"""Conveyor: a Panda picks parts off a moving belt, by known laws or by trained networks."""
 
 from torchdyn_plan.tasks.conveyor.task import TASK
 

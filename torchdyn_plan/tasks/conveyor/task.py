@@ -84,14 +84,15 @@ def maneuver() -> Any:
     return MatchVelocity(hover=0.1, descent_steps=40, hold_steps=8, lift_steps=20, **how)
 
 
-def dynamic(parts: PlannerParts, forecaster: Any) -> Any:
-    """The planner for one part, with that forecaster."""
+def dynamic(parts: PlannerParts, forecaster: Any, eta: Any = None) -> Any:
+    """The planner for one part, with that forecaster and those arrival times; by the joint limits for None."""
     from torchdyn_plan.planners import DynamicPlanner, MetWithin, ReplanSchedule
 
     own = maneuver()
     return DynamicPlanner(
         parts.static,
         forecaster,
+        eta,
         search=own.search(stride=5, first=5, margin=5.0, arrival_radius=0.06),
         schedule=ReplanSchedule.every(5),
         maneuver=own,
@@ -114,6 +115,13 @@ def meet(parts: PlannerParts) -> Any:
     from torchdyn_plan.planners import ChoosingPlanner
 
     return ChoosingPlanner(dynamic(parts, forecaster())).eval()
+
+
+def learned(parts: PlannerParts) -> Any:
+    """The same with a trained forecaster and trained arrival times."""
+    from torchdyn_plan.planners import ChoosingPlanner
+
+    return ChoosingPlanner(dynamic(parts, parts.forecaster, parts.eta)).eval()
 
 
 def first(parts: PlannerParts) -> Any:
@@ -143,6 +151,27 @@ def judge(settings: ConveyorSettings, log: Any, truth: Truth) -> Verdict:
     return Verdict(cause, {}, {})
 
 
+def record_paths(blocks: Any, **how: Any) -> dict[str, Any]:
+    """See `Task.record_paths`: parts that nobody takes."""
+    from torchdyn_plan.tasks.conveyor.data import record_belts
+
+    return record_belts(blocks, **how)
+
+
+def record_arrivals(planner: Any, **how: Any) -> dict[str, Any]:
+    """See `Task.record_arrivals`: the cups sent to poses along the belt."""
+    from torchdyn_plan.tasks.conveyor.data import record_arm_runs
+
+    return record_arm_runs(planner, **how)
+
+
+def fitting() -> Any:
+    """Sizes of its networks, and how they are scored."""
+    from torchdyn_plan.tasks.conveyor.data import conveyor_fitting
+
+    return conveyor_fitting()
+
+
 TASK = Task(
     name="conveyor",
     summary="A Panda picks parts off a belt.",
@@ -153,10 +182,13 @@ TASK = Task(
     make_env=make_env,
     digest=lambda: scene().digest(),
     static_planners={"ik": ik, "gain": gain},
-    planners={"pursuit": pursuit, "meet": meet, "first": first},
-    rivals=("first",),
+    planners={"pursuit": pursuit, "meet": meet, "first": first, "learned": learned},
+    rivals=("first", "learned"),
     rows_at_once=(32, 64),
     truth=truth,
     causes=("out of reach", "missed"),
     judge=judge,
+    record_paths=record_paths,
+    record_arrivals=record_arrivals,
+    fitting=fitting,
 )
