@@ -110,7 +110,9 @@ class Study:
         """Write all rows; ``more`` is written beside them."""
         if self.arguments.out is None:
             return
-        config = {name: _json(value) for name, value in dataclasses.asdict(self.arguments).items()}
+        # Not where it was written: that is a path of somebody's machine.
+        kept = {name: value for name, value in dataclasses.asdict(self.arguments).items() if name != "out"}
+        config = {name: _json(value) for name, value in kept.items()}
         about = {"machine": machine(), "versions": library_versions(), "scene": self.scene, "config": config}
         write_json(self.arguments.out, about | more | {"rows": self.rows})
 
