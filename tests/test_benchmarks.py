@@ -34,6 +34,7 @@ SMALL = {
     "kinematics_beside": "--former . --batches 1 --seconds 0.01 --no-compiled --no-rivals --repeats 1",
     "joint_speeds": "--episodes 4 --num-envs 4",
     "loops": "--planners corner --episodes 4 --steps 30 --loops rollout",
+    "noisy_replan": "--batches 1 --blocks 1 --seconds 0.01",
     "latency": "--velocities 5 --episodes 2 --latencies 0 20 --not-compensated 20",
     "reach_at_rest": "--episodes 4 --threads 1",
     "reach_ceiling": "--velocities 0.03 --episodes 8 --other-velocities 0.03 --other-episodes 8 --bounds-alone",
@@ -68,6 +69,7 @@ PARTS = {"air_hockey_side", "arms", "former_latency_side", "sides", "study"}
 
 
 LONG = {
+    "noisy_replan",
     "ablation",
     "braking",
     "calibration",
