@@ -26,6 +26,8 @@ ROBOTS = {
     7: ("iiwas/iiwa_only.xml", "iiwa_1/base", "iiwa_1/striker_joint_link"),
 }
 """Of an arm of so many joints: its file, and the bodies of its base and of its mallet."""
+VIEWS = {"defend": (-0.35, 2.3), "hit": (-0.05, 2.9)}
+"""Of a task: where along the table the camera looks, and from how far [m]."""
 
 
 class Side:
@@ -107,7 +109,8 @@ class Side:
 
         base = self.env.base_env
         camera = mujoco.MjvCamera()
-        camera.lookat[:], camera.distance, camera.azimuth, camera.elevation = (-0.35, 0.0, 0.0), 2.3, 0.0, -55.0
+        along, camera.distance = VIEWS[self.env.env_name.split("-")[1]]
+        camera.lookat[:], camera.azimuth, camera.elevation = (along, 0.0, 0.0), 0.0, -55.0
         if not hasattr(self, "renderer"):
             self.renderer = mujoco.Renderer(base._model, height, width)
         self.renderer.update_scene(base._data, camera)

@@ -64,7 +64,16 @@ ELSEWHERE = {
 """Minutes at the least, another environment, files of other packages, a picture of trainings, what the package's own
 arrival map is made by, a browser, a comparison of files, or networks of several trainings, which have a test of their
 own."""
-PARTS = {"air_hockey_side", "arms", "former_latency_side", "sides", "study"}
+PARTS = {
+    "air_hockey_agent",
+    "air_hockey_defend",
+    "air_hockey_hit",
+    "air_hockey_side",
+    "arms",
+    "former_latency_side",
+    "sides",
+    "study",
+}
 """No scripts of their own."""
 
 
