@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Any
 import torch
 from torch import Tensor
 
+from torchdyn_plan.checks import is_followed
 from torchdyn_plan.errors import CompileError, InputError
 from torchdyn_plan.kinematics.components import Component, Vector
 
@@ -37,7 +38,7 @@ class Fused:
             CompileError: there is no compiler, or it failed.
             InputError: an argument requires a gradient.
         """
-        if torch.is_grad_enabled() and any(argument.requires_grad for argument in arguments):
+        if is_followed(*arguments):
             raise InputError("a compiled solve has no derivatives: detach its arguments, or leave compiled=False")
         columns = [in_columns(argument) for argument in arguments]
         key = columns[0].device, columns[0].dtype
