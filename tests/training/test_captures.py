@@ -85,7 +85,7 @@ def test_collected_captures_are_learned_from(data, tmp_path):
     assert rows[0]["count"] == 40
     assert rows[0]["ranked"] > 0.95
     assert rows[0]["loss"] < 0.4
-    assert "train capture --task toy --steps 150" in file.with_suffix(".md").read_text()
+    assert "train capture --task toy --static straight --steps 150" in file.with_suffix(".md").read_text()
 
 
 def test_data_of_another_static_planner_is_refused(data, tmp_path):

@@ -64,7 +64,7 @@ def test_eta_learns_and_leaves_weights_curve_and_card(data, tmp_path):
     assert {"mode_all_mean", "expectation_all_p95"} <= json.loads((file.parent / "curve.json").read_text())[-1].keys()
     card = file.with_suffix(".md").read_text()
     for text in (
-        "train eta --task trapper --steps 300",
+        "train eta --task trapper --static ik --steps 300",
         TrapperScene().digest(),
         "samples: 200",
         "| at rest | expectation |",

@@ -43,9 +43,12 @@ def write_network(
         tables = score()
     file = network.save_pretrained(folder)
     write_json(folder / "scores.json", tables)
+    static = facts.get("static") or ""
+    # Data of a planner of one's own, package.module:NAME, needs no such option.
+    on = f" --static {static}" if static and ":" not in static else ""
     given = f"--steps {recipe.steps} --batch {recipe.batch} --lr {recipe.lr:g} --seed {recipe.seed}"
     facts = {
-        "command": f"`torchdyn-plan train {network_name or network.kind} --task {task} {given}`",
+        "command": f"`torchdyn-plan train {network_name or network.kind} --task {task}{on} {given}`",
         "recipe": asdict(recipe),
         **facts,
         "network": asdict(network.config),
