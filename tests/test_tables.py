@@ -78,6 +78,22 @@ def test_ceiling():
         agree(printed, [row["solvable"], row["ceiling"], *row["ceiling_ci"], reached / row["ceiling"]], first)
 
 
+def test_release():
+    rows = [row for row in rows_of("final-0.2.0.json") if "velocity" in row]
+    for first, printed in table("docs/results.md", "velocity | balls | *wait and drop* | *untrained*"):
+        of = [row for row in rows if row["velocity"] == float(first.split()[0])]
+        rates = (rate for row in of for rate in (row["success_solvable"], *row["success_solvable_ci"]))
+        agree(printed, [of[0]["solvable"], *rates], first)
+
+
+def test_trainings_with_noise():
+    rows = [row for row in rows_of("trainings_noisy.json") if "over" in row and "velocity" in row]
+    for first, printed in table("docs/sensors.md", "five trainings"):
+        of = [row for row in rows if row["sensor"] == first]
+        assert [row["velocity"] for row in of] == [1.0, 3.0, 5.0]
+        agree(printed, [x for row in of for x in (row["interquartile_mean"], *row["interquartile_mean_ci"])], first)
+
+
 def test_velocity_with_the_policy():
     rows, ik = rows_in("policy/velocity"), rows_in("velocity")
     for first, printed in table("docs/results.md", "velocity | solvable | target pursuit | corner | oracle"):
