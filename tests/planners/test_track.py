@@ -271,7 +271,7 @@ def test_a_measurement_takes_few_operations_and_none_takes_nearly_none(track, ro
     never = torch.full_like(now, torch.nan)
     with Operations() as nothing:
         assert track.add(state, never, places[:, -1], now) is state
-    assert nothing.count <= 2 * rows
+    assert nothing.count <= 2 + rows
 
 
 @ALL
@@ -309,6 +309,22 @@ def test_it_is_differentiable(track, bad):
     assert all(gradient.isfinite().all() for gradient in gradients)
     assert gradients[0][5].abs().sum() > 0.0
     assert torch.autograd.gradcheck(forecast, inputs)
+
+
+@pytest.mark.parametrize("passed", [1e3, 1e5, 1e9])
+def test_one_target_is_no_error_after_a_very_long_time(passed):
+    for track in [*KINDS, LeastSquaresTrack(patience=1e6, window=1e-3)]:
+        state = measured(track, *line(count=3)[:2])
+        late = torch.tensor(passed, dtype=torch.float64)
+        assert track.add(state, late, torch.zeros(3, dtype=torch.float64), late).used >= 1
+
+
+def test_an_exact_measurement_of_one_target_twice_is_no_error():
+    track, zero = KalmanTrack(), torch.zeros(1)
+    state = track.start(torch.zeros(1, 3))
+    for _ in range(3):
+        state = track.add(state, zero, torch.zeros(1, 3), zero, variance=0.0)
+    assert state.pos.shape == (1, 3)
 
 
 def test_derivatives_of_one_target_go_forward_too():

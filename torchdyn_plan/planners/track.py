@@ -28,7 +28,7 @@ from torchdyn_plan.checks import (
 )
 from torchdyn_plan.errors import InputError
 from torchdyn_plan.planners.rows import where_rows
-from torchdyn_plan.planners.track_row import updated_row
+from torchdyn_plan.planners.track_row import numbers_of, row_of, updated_row
 
 LARGEST = 1e6
 """Measurements farther from the origin [m], or with a larger time stamp [s], are rejected."""
@@ -222,14 +222,14 @@ class Track(ABC):
         if pos.shape != (*time.shape, coordinates) or time.shape != state.time.shape:
             check_trailing_shape("time of a measurement", time, *state.time.shape)
             check_trailing_shape("pos of a measurement", pos, *state.time.shape, coordinates)
+        measured = Measurement(time, pos, self.noise**2 if variance is None else variance)
+        if _is_row(state, measured) and (found := self._row(state, measured, now)) is not None:
+            return found
         looks = not hides_values(time)
         # A camera is slower than the control loop: most steps bring no measurement.
-        if looks and _is_nothing(debug_unwrap(time)):
+        if looks and bool(debug_unwrap(time).isnan().all()):
             return state
-        measured = Measurement(time, pos, self.noise**2 if variance is None else variance)
         if looks and _is_in_order(debug_unwrap(state.time), debug_unwrap(time), debug_unwrap(now)):
-            if _is_row(state.motion, state.time, measured) and (motion := self._row(state, measured)) is not None:
-                return state._replace(motion=motion, time=time, used=state.used + 1)
             expected = self._expect_next(state, measured)
             # The least of what is no number is no number, which is not above zero.
             if debug_unwrap(self._slack(expected)).min().item() >= 0.0:
@@ -252,19 +252,23 @@ class Track(ABC):
         """``(*B,)`` bool: whether the track can be used at time ``now`` (*B,) [s]."""
         return (state.used >= self.least) & (now - state.time <= self.patience)
 
-    def _row(self, state: TrackState, measured: Measurement) -> Tensor | None:
-        """The motion of a single target after a measurement that is not late, or None if it does not fit."""
+    def _row(self, state: TrackState, measured: Measurement, now: Tensor) -> TrackState | None:
+        """`add` for one target whose measurement is missing, or comes in order, soon, and fits; None for any other."""
+        _, last, begin, since, before, used, restarts, rejected = state
         time, pos, variance = measured
-        found = updated_row(
-            state.motion.flatten().tolist(),
-            pos.flatten().tolist(),
-            time.item() - state.time.item(),
-            variance.item() if isinstance(variance, Tensor) else variance,
-            drift=self._drift,
-            forgets=self.forgets,
-            gate=self.gate,
-        )
-        return None if found is None else state.motion.new_tensor(found).view_as(state.motion)
+        moment, earlier = time.item(), last.item()
+        if math.isnan(moment):
+            return state
+        passed = moment - earlier
+        if not (0.0 <= passed <= self.patience and moment <= now.item() + CLOCKS):
+            return None
+        variance = variance.item() if isinstance(variance, Tensor) else variance
+        numbers = numbers_of(state.motion), numbers_of(pos), passed, variance
+        found = updated_row(*numbers, drift=self._drift, forgets=self.forgets, gate=self.gate)
+        if found is None:
+            return None
+        motion = row_of(found, state.motion)
+        return TrackState(motion, time, begin, since, before, used + 1, restarts, rejected)
 
     def _expect_next(self, state: TrackState, measured: Measurement) -> Prediction:
         """`_expect` for the common case that no row's measurement is late: fewer operations, the same result."""
@@ -513,26 +517,17 @@ class LeastSquaresTrack(Track):
         return 0.0
 
 
-def _is_nothing(time: Tensor) -> bool:
-    """Whether no row has a measurement, from their times (*B,)."""
-    if time.numel() != 1:
-        return bool(time.isnan().all())
-    # Comparing a Python number is cheaper than comparing a tensor.
-    return math.isnan(time.item())
-
-
 def _is_in_order(before: Tensor, time: Tensor, now: Tensor) -> bool:
     """Whether every row has a measurement, none older than the row's newest (``before`` (*B,)) or from the future."""
-    if time.numel() != 1:
-        return bool(((time >= before) & (time <= now + CLOCKS)).all())
-    return before.item() <= time.item() <= now.item() + CLOCKS
+    return bool(((time >= before) & (time <= now + CLOCKS)).all())
 
 
-def _is_row(motion: Tensor, last: Tensor, measured: Measurement) -> bool:
+def _is_row(state: TrackState, measured: Measurement) -> bool:
     """Whether there is one target, on the CPU and without derivatives, so that numbers do for tensors."""
-    if measured.time.numel() != 1 or not motion.is_cpu or motion.dtype != measured.pos.dtype:
+    (time, pos, variance), motion = measured, state.motion
+    if time.numel() != 1 or not motion.is_cpu or motion.dtype != pos.dtype or torch.compiler.is_compiling():
         return False
-    return not is_followed(motion, last, *(value for value in measured if isinstance(value, Tensor)))
+    return not is_followed(motion, state.time, time, pos, variance if isinstance(variance, Tensor) else time)
 
 
 SIZES = {d * n + n * (n + 1) // 2: (d, n) for d in POINT_SIZES for n in (2, 3)}

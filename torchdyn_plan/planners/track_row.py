@@ -3,7 +3,33 @@
 from __future__ import annotations
 
 import math
+from array import array
 from collections.abc import Iterable
+
+import torch
+from torch import Tensor
+
+LARGEST_EXPONENT = 700.0
+"""Python's exponential of more is an error."""
+CODES = {torch.float32: "f", torch.float64: "d"}
+"""What arrays call the types of tensors."""
+
+
+def numbers_of(row: Tensor) -> list[float]:
+    """The numbers of a tensor (1, …, 1, D)."""
+    found = row.tolist()
+    while isinstance(found[0], list):
+        found = found[0]
+    return found
+
+
+def row_of(numbers: list[float], like: Tensor) -> Tensor:
+    """A tensor of ``numbers`` with the shape and type of ``like`` on the CPU."""
+    code = CODES.get(like.dtype)
+    if code is None:
+        return like.new_tensor(numbers).view_as(like)
+    # A third of the time that a tensor of a list takes.
+    return torch.frombuffer(array(code, numbers), dtype=like.dtype).view_as(like)
 
 
 def updated_row(
@@ -37,15 +63,17 @@ def updated_row(
         place = [here + 0.5 * passed * passed * change for here, change in zip(place, further, strict=True)]
         velocity = [speed + passed * change for speed, change in zip(velocity, further, strict=True)]
     if forgets:
-        weaker = math.exp(forgets * passed)
+        weaker = math.exp(forgets * passed) if forgets * passed < LARGEST_EXPONENT else math.inf
         triangle = [entry * weaker for entry in triangle]
     for i, j, power, factor in drift:
         # Where the triangle has entry (i, j), row by row: only the second and third row are shorter than the first.
         triangle[i + j + (i > 0 and further is not None)] += factor * passed**power
     scale, innovation = triangle[0] + variance, [seen - here for seen, here in zip(pos, place, strict=True)]
     farthest = scale * gate**2
+    # Comparisons are false for what is no number.
+    if not 0.0 < scale < math.inf:
+        return None
     for off in innovation:
-        # False for what is no number, too.
         if not off * off <= farthest:
             return None
     if further is None:
