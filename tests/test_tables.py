@@ -86,6 +86,16 @@ def test_release():
         agree(printed, [of[0]["solvable"], *rates], first)
 
 
+def test_sensors_in_the_readme():
+    sensors = ("2 mm, 250 Hz", "5 mm, 60 Hz, 20 ms late", "5 mm, 30 Hz, 5 % lost, 3 ms jitter")
+    exact, seen = rows_in("velocity"), rows_of("sensors.json")
+    for first, printed in table("README.md", "ball | exact"):
+        velocity = float(first.split()[0])
+        of = {(row["velocity"], row["sensor"]): row for row in seen if row["planner"] == "wait_and_drop"}
+        rows = [at(exact, "wait_and_drop", velocity=velocity), *(of[velocity, sensor] for sensor in sensors)]
+        agree(printed, [100 * row["success_solvable"] for row in rows], first)
+
+
 def test_trainings_with_noise():
     rows = [row for row in rows_of("trainings_noisy.json") if "over" in row and "velocity" in row]
     for first, printed in table("docs/sensors.md", "five trainings"):
