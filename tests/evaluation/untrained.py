@@ -9,6 +9,6 @@ from torchdyn_plan.tasks.trapper.task import ik_planner
 
 def untrained(**parts):
     torch.manual_seed(0)
-    # Narrower ones take kernels whose last bit depends on a row's place in the block.
+    # Narrower ones, and smaller blocks, take kernels whose last bit depends on a row's place in the block.
     nets = Forecaster(hidden=64).eval(), ETANetwork(hidden=64).eval()
-    return DynamicPlanner.paper(ik_planner(chunk=8), *nets, chunk=8, **parts).requires_grad_(False)
+    return DynamicPlanner.paper(ik_planner(chunk=32), *nets, chunk=32, **parts).requires_grad_(False)

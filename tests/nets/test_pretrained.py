@@ -146,7 +146,7 @@ def test_a_hostile_configuration_is_refused_at_once(network, tmp_path, change):
     started = time.process_time()
     with pytest.raises(WeightsError, match=r"forecaster\.safetensors'"):
         Forecaster.from_pretrained(file)
-    assert time.process_time() - started < 1.0
+    assert time.process_time() - started < 5.0
 
 
 @pytest.mark.parametrize(

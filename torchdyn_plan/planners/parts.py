@@ -93,7 +93,8 @@ class ComposedPlanner(PretrainedPlanner, Remembering):
             lost: decides when a target is lost; None if targets cannot be lost.
             turn: orientation of the tool where it meets the target. Then ``goal_pose`` is written in addition to
                 ``goal``, of three coordinates, and ``static`` and ``eta`` should read it. None for positions only.
-            chunk: plan in blocks of exactly this many rows, so that results do not depend on the batch size.
+            chunk: plan in blocks of exactly this many rows, so that results do not depend on the batch size; a multiple
+                of 32, as `IKPlanner` says.
             scene: digest of the scene that the planner belongs to; None if it belongs to none.
 
         Raises:

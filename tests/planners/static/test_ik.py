@@ -94,7 +94,7 @@ def test_a_planner_serves_another_precision_than_its_own():
 
 
 def test_a_chunk_makes_results_independent_of_the_batch_size():
-    planner, joint_pos, goal = ik_planner(chunk=8), home(21, spread=0.1), goals(21)
+    planner, joint_pos, goal = ik_planner(chunk=32), home(21, spread=0.1), goals(21)
     whole, _ = after(observe(joint_pos, goal), planner, 12)
     for rows in (slice(0, 1), slice(3, 5), slice(4, 17)):
         part, _ = after(observe(joint_pos[rows], goal[rows]), planner, 12)

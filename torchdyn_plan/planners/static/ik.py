@@ -93,7 +93,9 @@ class IKPlanner(Precise, StaticPlannerModule):
             gain: share of the remaining joint error that one step may cover, which brakes the arm at the end.
             acceleration: limit of each joint, or of all of them [rad/s²]. The arm then brakes by this limit instead of
                 ``gain``, and follows a moving goal one control step behind it. None for the gain only.
-            chunk: solve in blocks of exactly this many rows, so that results do not depend on the batch size.
+            chunk: solve in blocks of exactly this many rows, so that results do not depend on the batch size. Take a
+                multiple of 32: in a smaller block the last bit may depend on a row's place, as processors compute
+                what does not fill their vectors in another way.
             compiled: solve in one compiled loop. Needs a C++ compiler and some seconds at the first call (less if torch
                 has it cached); actions are the same up to rounding, do not depend on the batch size, and have no
                 derivatives.
