@@ -1,8 +1,10 @@
+import copy
+
 import pytest
 import torch
 
 from torchdyn_plan.errors import InputError
-from torchdyn_plan.nets import ETANetwork, Forecaster, SpreadForecaster, SpreadNetwork
+from torchdyn_plan.nets import CaptureNetwork, ETANetwork, Forecaster, SpreadForecaster, SpreadNetwork, inference
 from torchdyn_plan.nets.symmetry import square_symmetries
 
 FORECASTERS = [
@@ -48,6 +50,22 @@ def histories(count, length=24):
     return history
 
 
+def spread_forecaster(settings=FORECASTERS[0]):
+    network = forecaster(**settings)
+    spread = SpreadNetwork(features=16, horizon=20, hidden=8, rank=4).double()
+    torch.nn.init.normal_(spread.head.weight)
+    return SpreadForecaster(network, spread).eval().requires_grad_(False)
+
+
+def captures():
+    torch.manual_seed(0)
+    return CaptureNetwork(hidden=8).double().eval().requires_grad_(False)
+
+
+def captured(network):
+    return network.probability(histories(2, 80), samples(2, 1)[1], torch.tensor([40]))
+
+
 @pytest.mark.parametrize("settings", FORECASTERS)
 def test_a_forecaster_for_inference_forecasts_the_same(settings):
     network = forecaster(**settings)
@@ -68,16 +86,15 @@ def test_a_forecaster_for_inference_is_described_the_same(settings):
     assert not found[2].all()
 
 
-def test_a_spread_is_the_same_beside_a_forecaster_for_inference():
-    network = forecaster(**FORECASTERS[0])
-    spread = SpreadNetwork(features=16, horizon=20, hidden=8, rank=4).double().eval()
-    torch.nn.init.normal_(spread.head.weight)
-    whole, history = SpreadForecaster(network, spread), histories(60)
-    found, expected = whole.for_inference().predict(history), whole.predict(history)
-    torch.testing.assert_close(found.path, expected.path, atol=1e-11, rtol=1e-11)
+@pytest.mark.parametrize("settings", FORECASTERS[:2])
+def test_a_spread_is_the_same_beside_a_forecaster_for_inference(settings):
+    whole, history = spread_forecaster(settings), histories(60)
+    fast = whole.for_inference()
+    found, expected = fast.predict(history.view(5, 12, 24, 3)), whole.predict(history)
+    torch.testing.assert_close(found.path.flatten(0, 1), expected.path, atol=1e-11, rtol=1e-11)
     for one, other in zip(found.spread, expected.spread, strict=True):
-        torch.testing.assert_close(one, other)
-    assert whole.for_inference().history == whole.history == 24
+        torch.testing.assert_close(one.flatten(0, 1), other)
+    assert fast.history == whole.history == 24
 
 
 def test_forecasts_for_inference_turn_exactly_with_their_histories():
@@ -100,17 +117,35 @@ def test_an_eta_for_inference_gives_the_same_arrivals(estimator):
         assert found.bin_width == expected.bin_width
 
 
-def test_a_network_for_inference_is_a_copy_that_holds_and_saves_no_weights():
-    for network, inputs in ((forecaster(), [histories(2)]), (arrivals(), samples(2)[:2])):
-        fast = network.for_inference()
-        before = fast(*inputs).clone()
-        with torch.no_grad():
-            network.head.bias.add_(1.0)
-        assert torch.equal(fast(*inputs), before)
-        assert not torch.allclose(network.for_inference()(*inputs), before)
-        assert not [*fast.parameters(), *fast.state_dict()]
-        with pytest.raises(RuntimeError, match="Unexpected key"):
-            fast.load_state_dict(network.state_dict())
+ANSWERS = [
+    (spread_forecaster, lambda network: network.predict(histories(2)).spread.scale),
+    (spread_forecaster, lambda network: network.predict(histories(2)).path),
+    (arrivals, lambda network: network(*samples(2)[:2])),
+    (captures, captured),
+]
+
+
+@pytest.mark.parametrize(("make", "answer"), ANSWERS)
+def test_a_network_for_inference_is_a_copy_that_holds_and_saves_no_weights(make, answer):
+    network = make()
+    fast = network.for_inference()
+    before = answer(fast).clone()
+    for value in network.parameters():
+        value.add_(1.0)
+    assert torch.equal(answer(fast), before)
+    assert not torch.allclose(answer(network.for_inference()), before)
+    assert not [*fast.parameters(), *fast.state_dict()]
+    with pytest.raises(RuntimeError, match="Unexpected key"):
+        fast.load_state_dict(network.state_dict())
+
+
+@pytest.mark.parametrize("make", [spread_forecaster, arrivals, captures])
+def test_a_network_for_inference_is_where_its_network_is(make, monkeypatch):
+    # A device that is everywhere, but keeps no numbers: constants are computed from another network's.
+    network = make()
+    on_cpu = copy.deepcopy(getattr(network, "forecaster", network))
+    monkeypatch.setattr(inference, "in_double", lambda _: on_cpu)
+    assert {value.device.type for value in network.to("meta").for_inference().buffers()} == {"meta"}
 
 
 def test_a_network_for_inference_follows_dtype():

@@ -78,8 +78,9 @@ class Spread(NamedTuple):
     def between(self, offset: Tensor, half_width: Tensor | float) -> Tensor:
         """P(|offset + e| ≤ half_width) along each axis, for a position ``offset`` from the forecast [m]."""
         offset = offset.abs()
-        near, far = self.within(torch.stack([half_width + offset, (half_width - offset).abs()])).unbind(0)
-        return 0.5 * (near + torch.where(offset <= half_width, far, -far))
+        left = half_width - offset
+        near, far = self.within(torch.stack([half_width + offset, left.abs()])).unbind(0)
+        return 0.5 * (near + far.copysign(left))
 
     def interval(self, share: float) -> Tensor:
         """Half-width ``(*B, F, 2)`` of the interval about the forecast that holds the target with P = ``share`` [m]."""

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Sequence
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple, TypeVar
 
 from torch import Tensor, nn
 
@@ -13,6 +13,8 @@ from torchdyn_plan.errors import InputError
 
 if TYPE_CHECKING:
     from torchdyn_plan.nets.distributions import Spread
+
+Symmetry = TypeVar("Symmetry")
 
 
 class Forecast(NamedTuple):
@@ -105,11 +107,11 @@ class DescribedForecast(ForecastModel):
 
 
 def in_plane(
-    forecast: Callable[..., tuple[Tensor, Tensor, Tensor]], target_history: Tensor, *beside: Any
-) -> tuple[Tensor, Tensor, Tensor]:
+    forecast: Callable[..., tuple[Tensor, Tensor, Symmetry]], target_history: Tensor, *beside: Any
+) -> tuple[Tensor, Tensor, Symmetry]:
     """Result of ``forecast`` for histories (*B, H, 2) taken at height 0, and the further inputs ``beside``.
 
     Its path, the first entry, is reduced to x and y.
     """
-    path, *others = forecast(nn.functional.pad(target_history, (0, 1)), *beside)
-    return path[..., :2], others[0], others[1]
+    path, hidden, symmetry = forecast(nn.functional.pad(target_history, (0, 1)), *beside)
+    return path[..., :2], hidden, symmetry

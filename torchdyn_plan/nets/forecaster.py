@@ -107,6 +107,7 @@ class Forecaster(Pretrained, Precise, DescribedForecast):
     present_feature_scale: Tensor
     step_factor: Tensor
     departure_scale: Tensor
+    per_variance: Tensor
     fallen: Tensor
 
     def __init__(self, config: ForecasterConfig | None = None, **settings: Any) -> None:
@@ -125,7 +126,7 @@ class Forecaster(Pretrained, Precise, DescribedForecast):
         if config.half_extent is not None:
             present += [1.0 / config.horizon] * 2 + [0.25] * 2 + [1.0 / config.length_scale] * 2
         if config.tracked:
-            present += [0.25, 0.25, 1.0]
+            present += [0.125, 0.125, 1.0]
         self.join = nn.Linear(channels * length + len(present), config.hidden)
         self.hidden = nn.Linear(config.hidden, config.hidden)
         self.mix = nn.Linear(config.hidden, config.rank)
@@ -134,7 +135,7 @@ class Forecaster(Pretrained, Precise, DescribedForecast):
         self.head.weight.data.mul_(0.1)
         steps = torch.arange(1.0, config.horizon + 1.0)
         level, height = config.step_scale * steps, torch.full_like(steps, config.height_scale)
-        constants: dict[str, Tensor] = {}
+        constants = {"per_variance": torch.tensor([1e6, 1e2])} if config.tracked else {}
         self.law = None
         if config.gravity is not None:
             law: dict[str, Any] = {"control_step": config.control_step, "gravity": config.gravity, "drag": config.drag}
@@ -212,10 +213,10 @@ class Forecaster(Pretrained, Precise, DescribedForecast):
             # A small share of the position breaks ties for a target that moves along an axis or rests.
             turn = self.symmetries[octant(torch.add(now - before, now, alpha=1e-6))]
             history = torch.bmm(history, turn)
-        known = None
+        known: tuple[Tensor, ...] = ()
         if config.tracked:
             covariance = check_covariance(target_covariance, target_history, **about)
-            known = how_well_known(covariance.view(-1, 2, 2))
+            known = how_well_known(covariance, self.per_variance)
         line, hidden = self._line(history[:, config.stride - 1 :: config.stride], known)
         if reflected:
             assert config.half_extent is not None
@@ -226,10 +227,10 @@ class Forecaster(Pretrained, Precise, DescribedForecast):
         path = line.mT.view(*target_history.shape[:-2], config.horizon, 3)
         return path if path.dtype == target_history.dtype else path.to(target_history.dtype), hidden, swapped
 
-    def _line(self, history: Tensor, known: Tensor | None) -> tuple[Tensor, Tensor]:
+    def _line(self, history: Tensor, known: tuple[Tensor, ...]) -> tuple[Tensor, Tensor]:
         """Unreflected positions (R, 3, F) for the rotated histories (R, H, 3) [m], and the last hidden layer.
 
-        ``known`` (R, 3) is from `how_well_known`. Features and hidden values have the type of the layers' weights.
+        ``known`` is from `how_well_known`, if at all. Features and hidden values have the type of the layers' weights.
         """
         now, step = history[:, -1], history[:, 1:] - history[:, :-1]
         if self.config.stride > 1:
@@ -260,7 +261,7 @@ class Forecaster(Pretrained, Precise, DescribedForecast):
         change = torch.asinh((step - step[:, -1:]) * (real / self.config.change_scale))
         return torch.cat([step, change, real.to(step.dtype)], dim=-1) * self.step_feature_scale
 
-    def _present_features(self, now: Tensor, step: Tensor, known: Tensor | None) -> Tensor:
+    def _present_features(self, now: Tensor, step: Tensor, known: tuple[Tensor, ...]) -> Tensor:
         """Newest position and step, ``(R, 3)`` each, when and where they reach a cushion, and ``known``."""
         features, extent, horizon = [now, step], self.config.half_extent, self.config.horizon
         if extent is not None:
@@ -268,9 +269,7 @@ class Forecaster(Pretrained, Precise, DescribedForecast):
             direction = torch.where(speed < 0, -1.0, 1.0)
             wait = (extent - place * direction).div_((speed * direction).clamp_min(1e-6)).clamp(0.0, 2.0 * horizon)
             features += [wait, wait.log1p(), reflect(torch.addcmul(place, speed, wait.flip(-1)), extent)]
-        if known is not None:
-            features.append(known)
-        return torch.cat(features, dim=-1) * self.present_feature_scale
+        return torch.cat([*features, *known], dim=-1) * self.present_feature_scale
 
 
 def keys_of(config: ForecasterConfig) -> tuple[str, ...]:
@@ -287,15 +286,15 @@ def check_covariance(covariance: Tensor | None, history: Tensor, **about: Any) -
     return network_input(keys.TARGET_COVARIANCE, covariance, 2, 2, **about)
 
 
-def how_well_known(covariance: Tensor) -> Tensor:
-    """Features ``(R, 3)`` of covariances (R, 2, 2) of position and velocity.
+def how_well_known(covariance: Tensor, per_variance: Tensor) -> tuple[Tensor, Tensor]:
+    """Features of covariances (R, 2, 2) of position and velocity: logarithms of both variances, and the correlation.
 
-    These are the logarithms of both standard deviations, in units of 1 mm and 0.1 m/s, and the correlation.
+    ``per_variance`` (2,) are one over the variances' units. Returns ``(R, 2)`` and ``(R, 1)``.
     """
-    place, both, speed = covariance[:, 0, 0], covariance[:, 0, 1], covariance[:, 1, 1]
-    place, speed = place + LEAST_VARIANCE, speed + LEAST_VARIANCE
-    deviations = torch.stack([place * 1e6, speed * 1e2], dim=-1).log() * 0.5
-    return torch.cat([deviations, (both * (place * speed).rsqrt()).unsqueeze(-1)], dim=-1)
+    numbers = covariance.reshape(-1, 4)
+    variances = numbers[:, ::3] + LEAST_VARIANCE
+    correlation = numbers[:, 1:2] * variances.prod(-1, keepdim=True).rsqrt()
+    return (variances * per_variance).log(), correlation
 
 
 LEAST_SAMPLES = 2

@@ -10,7 +10,7 @@ import copy
 import operator
 from collections.abc import Iterable, Sequence
 from functools import partial
-from typing import TYPE_CHECKING, Any, Self
+from typing import TYPE_CHECKING, Any, Self, TypeVar
 
 import torch
 from torch import Tensor, nn
@@ -22,6 +22,8 @@ from torchdyn_plan.nets.arrival import ArrivalModel, ArrivalQuery
 from torchdyn_plan.nets.capture import CaptureModel
 from torchdyn_plan.nets.distributions import ESTIMATORS, Arrival, Spread, arrival_moments, without_never
 from torchdyn_plan.nets.forecast import DescribedForecast, Forecast, in_plane
+from torchdyn_plan.nets.forecaster import check_covariance, convolve, how_well_known
+from torchdyn_plan.nets.spread import LOG_SCALE, LOG_SHAPE
 from torchdyn_plan.precision import Precise, autocast_is_on, in_type_of, without_autocast
 
 if TYPE_CHECKING:
@@ -34,11 +36,23 @@ DENSE = 2**14
 """A convolution is written out as one matrix over all steps if that matrix has at most this many weights."""
 
 
-def hold_constants(module: nn.Module, dtype: torch.dtype, **constants: Tensor) -> None:
-    """Register ``constants`` as buffers of ``module``, in float32 at least: neither trained, nor saved."""
-    dtype = torch.promote_types(dtype, torch.float32)
+Network = TypeVar("Network", bound=nn.Module)
+
+
+def in_double(network: Network) -> Network:
+    """A copy of ``network`` to compute constants with: float64 and on the CPU, as some devices have no float64."""
+    return copy.deepcopy(network).to("cpu", torch.float64)
+
+
+def hold_constants(module: nn.Module, like: Tensor, **constants: Tensor) -> None:
+    """Register ``constants`` as buffers of ``module``, where ``like`` is: neither trained, nor saved.
+
+    Numbers get its type, and float32 at least.
+    """
+    dtype = torch.promote_types(like.dtype, torch.float32)
     for name, value in constants.items():
-        module.register_buffer(name, value.detach().to(dtype).contiguous(), persistent=False)
+        kept = value.detach().to(like.device, dtype if value.is_floating_point() else value.dtype, copy=True)
+        module.register_buffer(name, kept.contiguous(), persistent=False)
 
 
 class Prepared:
@@ -97,6 +111,8 @@ class InferenceForecaster(Precise, DescribedForecast):
     fallen: Tensor
     turns: Tensor
     octants: Tensor
+    swaps: Tensor
+    per_variance: Tensor
     embed_weight: Tensor
     embed_bias: Tensor
     join_weight: Tensor
@@ -107,6 +123,8 @@ class InferenceForecaster(Precise, DescribedForecast):
     mix_bias: Tensor
     head_weight: Tensor
     head_bias: Tensor
+    least: Tensor
+    most: Tensor
     spread_hidden_weight: Tensor
     spread_hidden_bias: Tensor
     spread_mix_weight: Tensor
@@ -121,31 +139,36 @@ class InferenceForecaster(Precise, DescribedForecast):
         self.history, self.in_keys, self.samples = config.history, network.in_keys, network.samples
         self.judged = spread is not None
         self.law = network.law
-        dtype, exact = network.head.weight.dtype, copy.deepcopy(network).double()
-        hold_constants(self, dtype, turns=_turns(exact), octants=_octants(exact))
+        like, exact = network.head.weight, in_double(network)
+        swaps = exact.symmetries[:, :1, :1, None] == 0.0
+        hold_constants(self, like, turns=_turns(exact), octants=_octants(exact), swaps=swaps)
+        if config.tracked:
+            hold_constants(self, like, per_variance=exact.per_variance)
         if self.law is not None:
-            hold_constants(self, dtype, fallen=exact.fallen)
+            hold_constants(self, like, fallen=exact.fallen)
         embed: Any = exact.embed
         weight = embed.weight.squeeze(-1) * exact.step_feature_scale
-        hold_constants(self, dtype, embed_weight=weight.mT, embed_bias=embed.bias, zero=torch.zeros(1))
+        hold_constants(self, like, embed_weight=weight.mT, embed_bias=embed.bias, zero=torch.zeros(1))
         length = config.history // config.stride - 1
         self.dense, self.lengths = [], [length]
         for number, layer in enumerate(exact.convolve):
             weight, bias, length, dense = _convolution(layer, length)
             self.dense.append(dense)
             self.lengths.append(length)
-            hold_constants(self, dtype, **{f"convolve_weight_{number}": weight, f"convolve_bias_{number}": bias})
+            hold_constants(self, like, **{f"convolve_weight_{number}": weight, f"convolve_bias_{number}": bias})
         weight, bias = _join(exact)
-        hold_constants(self, dtype, join_weight=weight.mT, join_bias=bias)
-        hold_constants(self, dtype, hidden_weight=exact.hidden.weight.mT, hidden_bias=exact.hidden.bias)
-        hold_constants(self, dtype, mix_weight=exact.mix.weight.mT, mix_bias=exact.mix.bias)
+        hold_constants(self, like, join_weight=weight.mT, join_bias=bias)
+        hold_constants(self, like, hidden_weight=exact.hidden.weight.mT, hidden_bias=exact.hidden.bias)
+        hold_constants(self, like, mix_weight=exact.mix.weight.mT, mix_bias=exact.mix.bias)
         weight, bias = _head(exact)
-        hold_constants(self, dtype, head_weight=weight.mT, head_bias=bias)
+        hold_constants(self, like, head_weight=weight.mT, head_bias=bias)
         if spread is not None:
+            least, most = torch.tensor([LOG_SCALE, LOG_SHAPE]).view(2, 2, 1, 1).unbind(1)
+            hold_constants(self, like, least=least, most=most)
             for name in ("hidden", "mix", "head"):
                 layer = getattr(spread, name)
                 constants = {f"spread_{name}_weight": layer.weight.mT, f"spread_{name}_bias": layer.bias}
-                hold_constants(self, dtype, **constants)
+                hold_constants(self, like, **constants)
 
     def forward(self, target_history: Tensor, target_covariance: Tensor | None = None) -> Tensor:
         """Positions at the next F control steps, ``(*B, F, 3)`` [m, world], see `Forecaster.forward`."""
@@ -157,15 +180,15 @@ class InferenceForecaster(Precise, DescribedForecast):
     ) -> tuple[Tensor, Tensor, Tensor]:
         """The same forecast, and the features for a spread, see `Forecaster.describe`."""
         self._check(target_history, target_covariance)
-        forecast, hidden, turn = self._forecast(target_history, target_covariance)
+        forecast, hidden, symmetry = self._forecast(target_history, target_covariance)
         batch = target_history.shape[:-2]
         hidden = in_type_of(forecast, hidden).view(*batch, self.config.hidden)
-        return forecast, hidden, (turn[:, 0, 0] == 0.0).view(batch)
+        if symmetry is None:
+            return forecast, hidden, hidden.new_zeros(batch, dtype=torch.bool)
+        return forecast, hidden, self.swaps.index_select(0, symmetry).view(batch)
 
     def _check(self, target_history: Tensor, target_covariance: Tensor | None) -> None:
         """Raise `InputError` for an input that is none."""
-        from torchdyn_plan.nets.forecaster import check_covariance
-
         size = 2 if target_history.shape[-1:] == (2,) else 3
         network_input("target_history", target_history, self.config.history, size, like=self.head_weight)
         if self.config.tracked:
@@ -173,8 +196,8 @@ class InferenceForecaster(Precise, DescribedForecast):
 
     def _forecast(
         self, target_history: Tensor, target_covariance: Tensor | None = None
-    ) -> tuple[Tensor, Tensor, Tensor]:
-        """Positions (*B, F, 3), hidden features (R, hidden) and the symmetry applied to each row (R, 3, 7)."""
+    ) -> tuple[Tensor, Tensor, Tensor | None]:
+        """Positions (*B, F, 3), hidden features (R, hidden) and which symmetry each row has (R,), if it has one."""
         config, like = self.config, self.head_weight
         if autocast_is_on():
             return without_autocast(self._forecast, target_history, target_covariance)
@@ -188,55 +211,53 @@ class InferenceForecaster(Precise, DescribedForecast):
             # The nearest of the eight octants' middles selects a row's symmetry, its inverse, and the line's shift.
             now = history[:, -1]
             direction = (now - history[:, -2]).add_(now, alpha=1e-6)
-            turn = self.turns.index_select(0, direction.mm(self.octants).argmax(dim=-1))
+            symmetry = direction.mm(self.octants).argmax(dim=-1)
+            turn = self.turns.index_select(0, symmetry)
         else:
-            turn = self.turns[:1].expand(len(history), 3, 7)
-        history = torch.bmm(history[:, config.stride - 1 :: config.stride], turn[..., :3])
+            symmetry, turn = None, self.turns[:1].expand(len(history), 3, 7)
+        there, back, shift = turn.split((3, 3, 1), dim=-1)
+        history = torch.bmm(history[:, config.stride - 1 :: config.stride], there)
         step, now = history[:, 1:] - history[:, :-1], history[:, -1]
         if config.stride > 1:
             step.mul_(1.0 / config.stride)
-        known = () if target_covariance is None or not config.tracked else (self._known(target_covariance),)
+        known: tuple[Tensor, ...] = ()
+        if config.tracked and target_covariance is not None:
+            known = how_well_known(target_covariance.to(like), self.per_variance)
         line, hidden = self._line(step, now, step[:, -1], *known)
         if config.half_extent is not None:
             level = line[:, :2]
             level.sub_(level.round()).abs_()
-        path = torch.bmm(turn[..., 3:6], line).add_(turn[..., 6:])
+        path = torch.bmm(back, line).add_(shift)
         path = path.mT.view(*target_history.shape[:-2], config.horizon, 3)
-        return path if seen is target_history else path.to(target_history.dtype), hidden, turn
+        return path if seen is target_history else path.to(target_history.dtype), hidden, symmetry
 
     def predict(self, *seen: Tensor) -> Forecast:
         """The path, and its spread if there is a spread network.
 
         The caller, such as a planner, must have checked for NaN.
         """
-        path, hidden, turn = self._forecast(*seen)
+        path, hidden, symmetry = self._forecast(*seen)
         if not self.judged:
             return Forecast(path)
-        spread = self._spread(hidden, turn, path.shape[:-2])
+        spread = self._spread(hidden, symmetry, path.shape[:-2])
         return Forecast(path, spread if path.dtype == hidden.dtype else Spread(*in_type_of(path, *spread)))
 
-    def _spread(self, hidden: Tensor, turn: Tensor, batch: torch.Size) -> Spread:
-        """`SpreadNetwork.forward` of features (R, hidden) of rows with symmetry ``turn`` (R, 3, 7)."""
+    def _spread(self, hidden: Tensor, symmetry: Tensor | None, batch: torch.Size) -> Spread:
+        """`SpreadNetwork.forward` of features (R, hidden) of rows with this ``symmetry`` (R,)."""
         if autocast_is_on():
-            return without_autocast(self._spread, hidden, turn, batch)
+            return without_autocast(self._spread, hidden, symmetry, batch)
         features = torch.addmm(self.spread_hidden_bias, hidden, self.spread_hidden_weight).relu_()
         features = torch.addmm(self.spread_mix_bias, features, self.spread_mix_weight)
         out = torch.addmm(self.spread_head_bias, features, self.spread_head_weight)
-        out = out.view(len(hidden), 5, self.config.horizon)
+        horizon = self.config.horizon
+        out = out.view(*batch, 5, horizon)
         # Entries 0 and 1 are the scales, 2 and 3 the shapes, along x and y or, in rows whose axes are swapped, y and x.
-        swapped = (turn[:, :1, :1] == 0.0).unsqueeze(-1)
-        level = out[:, :4].view(len(hidden), 2, 2, self.config.horizon)
-        level = torch.where(swapped, level.flip(2), level).mT
-        scale, shape = level[:, 0].clamp(-18.0, 4.0).exp(), level[:, 1].clamp(-3.0, 3.0).exp()
-        gone, horizon = out[:, 4].sigmoid(), self.config.horizon
-        scale, shape = scale.reshape(*batch, horizon, 2), shape.reshape(*batch, horizon, 2)
-        return Spread(scale, shape, gone.view(*batch, horizon))
-
-    def _known(self, target_covariance: Tensor) -> Tensor:
-        """Inputs ``(R, 3)`` from the covariance (*B, 2, 2) of position and velocity."""
-        from torchdyn_plan.nets.forecaster import how_well_known
-
-        return how_well_known(target_covariance.to(self.head_weight).reshape(-1, 2, 2))
+        level = out[..., :4, :].view(*batch, 2, 2, horizon)
+        if symmetry is not None:
+            swapped = self.swaps.index_select(0, symmetry).view(*batch, 1, 1, 1)
+            level = torch.where(swapped, level.flip(-2), level)
+        scale, shape = level.mT.clamp(self.least, self.most).exp_().unbind(-3)
+        return Spread(scale, shape, out[..., 4, :].sigmoid())
 
     def _line(self, step: Tensor, now: Tensor, newest: Tensor, *known: Tensor) -> tuple[Tensor, Tensor]:
         """Unreflected line (R, 3, F) and hidden features; with cushions x and y count in periods of the reflection."""
@@ -299,20 +320,20 @@ class InferenceETA(Precise, ArrivalModel):
         """Copy the current weights of ``network``."""
         super().__init__()
         self.config = config = network.config
-        dtype, exact, size = network.head.weight.dtype, copy.deepcopy(network).double(), config.coordinates
+        like, exact, size = network.head.weight, in_double(network), config.coordinates
         parts = [size, size, 2, 6 * config.turned]
         goal, offset, lengths, axes = (exact.goal_in.weight * exact.goal_scale).split(parts, dim=1)
         bias = exact.state_in.bias + exact.state_in.weight @ exact.state_shift + exact.goal_in.weight @ exact.goal_shift
         state = (exact.state_in.weight * exact.state_scale).clone()
         state[:, slice(*config.tool_slice)] -= offset
-        hold_constants(self, dtype, state_weight=state.mT, state_bias=bias)
-        hold_constants(self, dtype, goal_weight=torch.cat([goal + offset, lengths, axes], dim=1).mT)
+        hold_constants(self, like, state_weight=state.mT, state_bias=bias)
+        hold_constants(self, like, goal_weight=torch.cat([goal + offset, lengths, axes], dim=1).mT)
         for name in ("second", "third", "head"):
             layer = getattr(exact, name)
-            hold_constants(self, dtype, **{f"{name}_weight": layer.weight.mT, f"{name}_bias": layer.bias})
-        hold_constants(self, dtype, square_sums=torch.tensor([[1.0, 1.0], [1.0, 1.0], [0.0, 1.0]])[:size])
+            hold_constants(self, like, **{f"{name}_weight": layer.weight.mT, f"{name}_bias": layer.bias})
+        hold_constants(self, like, square_sums=torch.tensor([[1.0, 1.0], [1.0, 1.0], [0.0, 1.0]])[:size])
         hold_constants(
-            self, dtype, moments=arrival_moments(exact.head.weight.new_empty(config.bins + 1), config.bin_width)
+            self, like, moments=arrival_moments(exact.head.weight.new_empty(config.bins + 1), config.bin_width)
         )
 
     def forward(self, robot_state: Tensor, goal: Tensor) -> Tensor:
@@ -347,7 +368,9 @@ class InferenceETA(Precise, ArrivalModel):
         if seen.shape[-1:] != (size,) or seen.dtype != weight.dtype or seen.device != weight.device:
             seen = network_input("robot_state", seen, size, like=weight, finite=False)
         tool_pos = seen[..., slice(*self.config.tool_slice)]
-        return tool_pos, nn.functional.linear(seen, weight.mT, self.state_bias)
+        # As `linear`, which would transpose the weight and back.
+        shared = torch.addmm(self.state_bias, seen.reshape(-1, size), weight)
+        return tool_pos, shared.view(*seen.shape[:-1], weight.shape[-1])
 
     def read(self, tool_pos: Tensor, state: Tensor, goal: Tensor, *, estimator: str = "mode") -> Arrival:
         """Arrival time at ``goal`` (*B, 3) for tools (*B, 3) and the states' share of the first layer (*B, hidden)."""
@@ -397,14 +420,14 @@ class InferenceCapture(Precise, CaptureModel):
         """Copy the current weights of ``network``."""
         super().__init__()
         self.config = config = network.config
-        dtype, exact = network.head.weight.dtype, copy.deepcopy(network).double()
-        steps = torch.arange(-config.window, config.window + 1, config.stride, device=exact.shift.device)
-        self.register_buffer("about", steps, persistent=False)
+        like, exact = network.head.weight, in_double(network)
+        steps = torch.arange(-config.window, config.window + 1, config.stride)
+        hold_constants(self, like, about=steps, one=torch.ones(1))
         first, bias = exact.first.weight, exact.first.bias + exact.first.weight @ exact.shift
-        hold_constants(self, dtype, one=torch.ones(1), first_weight=(first * exact.scale).mT, first_bias=bias)
+        hold_constants(self, like, first_weight=(first * exact.scale).mT, first_bias=bias)
         for name in ("second", "head"):
             layer = getattr(exact, name)
-            hold_constants(self, dtype, **{f"{name}_weight": layer.weight.mT, f"{name}_bias": layer.bias})
+            hold_constants(self, like, **{f"{name}_weight": layer.weight.mT, f"{name}_bias": layer.bias})
 
     def probability(self, path: Tensor, goal: Tensor, steps: Tensor) -> Tensor:
         """As of `CaptureModel`."""
@@ -448,8 +471,6 @@ def _octants(network: Forecaster) -> Tensor:
 
 def _convolution(layer: Any, length: int) -> tuple[Tensor, Tensor, int, bool]:
     """Weight, bias and length of the output of a convolution of ``length`` steps, and whether it is written out."""
-    from torchdyn_plan.nets.forecaster import convolve
-
     channels, after = layer.in_channels, max(length // 2, 1)
     padded = length < 3 or (length - 3) % 2 != 0
     if not padded and length * after * channels**2 > DENSE:

@@ -14,6 +14,9 @@ from torchdyn_plan.nets.forecaster import Forecaster
 from torchdyn_plan.nets.pretrained import Pretrained
 from torchdyn_plan.precision import autocast_is_on, in_type_of, without_autocast
 
+LOG_SCALE, LOG_SHAPE = (-18.0, 4.0), (-3.0, 3.0)
+"""Least and greatest logarithm of a spread's scale [m] and of its shape."""
+
 
 @dataclass(frozen=True, kw_only=True)
 class SpreadConfig:
@@ -88,7 +91,8 @@ class SpreadNetwork(Pretrained, nn.Module):
         out = out.view(*features.shape[:-1], 5, self.config.horizon)
         level = out[..., :4, :].unflatten(-2, (2, 2)).transpose(-1, -2)
         level = torch.where(swapped[..., None, None, None], level.flip(-1), level)
-        return level[..., 0, :, :].clamp(-18.0, 4.0), level[..., 1, :, :].clamp(-3.0, 3.0), out[..., 4, :]
+        scale, shape = level.unbind(-3)
+        return scale.clamp(*LOG_SCALE), shape.clamp(*LOG_SHAPE), out[..., 4, :]
 
 
 class SpreadForecaster(ForecastModel):

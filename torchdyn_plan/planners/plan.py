@@ -149,11 +149,12 @@ class Plan(NamedTuple):
             path: ``(*B, F, D)`` its forecast from then on.
             length: number of positions to keep; the last one is repeated after the end of the forecast.
         """
-        whole = path.narrow(-2, 0, 0)
+        kept = path[..., : max(length - 1, 0), :]
         if length:
-            whole = torch.cat([target_pos.unsqueeze(-2), path], dim=-2)
-            whole = whole[..., torch.arange(length, device=path.device).clamp(max=path.shape[-2]), :]
-        return cls(*meeting, usable, whole, torch.zeros_like(meeting.arrival_steps))
+            kept = torch.cat([target_pos.unsqueeze(-2), kept], dim=-2)
+        if missing := length - kept.shape[-2]:
+            kept = torch.cat([kept, kept[..., -1:, :].expand(*kept.shape[:-2], missing, -1)], dim=-2)
+        return cls(*meeting, usable, kept, torch.zeros_like(meeting.arrival_steps))
 
     def older(self) -> Plan:
         """The plan one control step later."""

@@ -112,7 +112,7 @@ def look_into(search: Any, shown: Shown, eta: ArrivalQuery, grid: Tensor, *, ste
     path, now, descent = shown.forecast.path[:1], shown.target_pos[:1], getattr(search, "descent_steps", 0.0)
     lost_at, turn = shown.context.lost, shown.context.turn
     if hasattr(search, "candidates"):
-        found = search.candidates(path, now, lost_at)
+        found = search.candidates(torch.cat([now.unsqueeze(-2), path], dim=-2), lost_at)
         thin = slice(None, None, -(-found.goals.shape[-2] // CANDIDATES))
         goals, target_steps = found.goals[:, thin], found.target_steps.expand(found.goals.shape[:-1])[:, thin]
         lost = None if found.lost is None else found.lost[:, thin]

@@ -193,8 +193,9 @@ def test_places_near_the_robots_axis_are_left_where_others_are_as_good(axis_cost
 def test_only_places_within_reach_of_the_axis_lose():
     forecast, here = paths(20)
     plain, shy = ExactSearch(), ExactSearch(base_pos=(0.1, 0.0), axis_radius=0.12, axis_cost=3.0)
-    before, after = (search.candidates(forecast, here).score.expand(20, -1) for search in (plain, shy))
-    away = (plain.candidates(forecast, here).goals[..., :2] - torch.tensor([0.1, 0.0])).norm(dim=-1)
+    whole = torch.cat([here.unsqueeze(-2), forecast], dim=-2)
+    before, after = (search.candidates(whole).score.expand(20, -1) for search in (plain, shy))
+    away = (plain.candidates(whole).goals[..., :2] - torch.tensor([0.1, 0.0])).norm(dim=-1)
     torch.testing.assert_close(before - after, 3.0 * ((0.12 - away) / 0.08).clamp(0.0, 1.0))
 
 

@@ -216,7 +216,7 @@ def test_captures_are_asked_about_the_whole_path_once():
     CAUTIOUS(Forecast(forecast), here, blurred_robot(), SearchContext(**known))
     ((path, goal, steps),) = asked
     assert torch.equal(path, torch.cat([here.unsqueeze(-2), forecast], dim=-2))
-    candidates = CAUTIOUS.candidates(forecast, here)
+    candidates = CAUTIOUS.candidates(path)
     assert torch.equal(goal, candidates.goals)
     assert torch.equal(steps, candidates.target_steps)
     FULL(Forecast(forecast), here, robot()[0], SearchContext(**known))

@@ -167,7 +167,8 @@ class ExactSearch:
             InputError: an argument has another shape, or their batches differ.
         """
         check_context(forecast.path, target_pos, context)
-        candidates = self.candidates(forecast.path, target_pos, context.lost)
+        whole = torch.cat([target_pos.unsqueeze(-2), forecast.path], dim=-2)
+        candidates = self.candidates(whole, context.lost)
         if context.turn is not None:
             turns = context.turn[..., (candidates.steps - 1).clamp_min(0), :]
             candidates = candidates._replace(goals=torch.cat([candidates.goals, turns], dim=-1))
@@ -192,7 +193,6 @@ class ExactSearch:
                 spread = None if forecast.spread is None else forecast.spread.at(candidates.steps)
                 probability = meeting_probability(arrival, eta_steps, time, spread, offset, half_width=self.footprint)
                 if context.capture is not None:
-                    whole = torch.cat([target_pos.unsqueeze(-2), forecast.path], dim=-2)
                     seen = whole, candidates.goals, candidates.target_steps
                     probability = probability * context.capture.probability(*seen)
             best, reachable = self._choose(candidates, kept, eta_steps, probability)
@@ -221,29 +221,27 @@ class ExactSearch:
         early = candidates.target_steps - self.descent_steps - eta_steps
         slack = early - self.margin
         if kept is not None:
-            score = score + self.switching_cost * kept
+            score = torch.add(score, kept, alpha=self.switching_cost)
             slack = torch.where(kept, early, slack)
         if probability is not None:
             score = score + self.probability_weight * probability
         in_time, late = slack >= 0.0, slack.clamp(min=-LATEST)
         if candidates.dwell_steps is not None:
-            in_time = in_time & (candidates.dwell_steps > 0)
-            late = late - LATE_OUT_OF_REACH * (candidates.dwell_steps == 0)
+            never = candidates.dwell_steps == 0
+            in_time, late = in_time & ~never, torch.add(late, never, alpha=-LATE_OUT_OF_REACH)
         if candidates.lost is not None:
-            in_time = in_time & ~candidates.lost
-            late = late - LATE_LOST * candidates.lost
+            in_time, late = in_time & ~candidates.lost, torch.add(late, candidates.lost, alpha=-LATE_LOST)
         some = in_time.any(dim=-1, keepdim=True)
         score = torch.where(some, torch.where(in_time, score, -torch.inf), late)
         return score.argmax(dim=-1, keepdim=True), some.squeeze(-1)
 
-    def candidates(self, path: Tensor, target_pos: Tensor, lost: Lost | None = None) -> Candidates:
-        """Where and when a target could be met that is at ``target_pos`` (*B, D) and then along ``path`` (*B, F, D)."""
-        whole = torch.cat([target_pos.unsqueeze(-2), path], dim=-2)
-        first = min(self.first, path.shape[-2])
-        steps = torch.arange(first, whole.shape[-2], self.stride, device=path.device)
-        places = whole[..., first :: self.stride, :]
-        waited = places if self.early_steps == 0 else whole[..., (steps - self.early_steps).clamp_min(0), :]
-        goals, gone = self.goals(waited), None if lost is None else lost.forecast(whole)
+    def candidates(self, path: Tensor, lost: Lost | None = None) -> Candidates:
+        """Where and when a target could be met that is along ``path`` (*B, F + 1, D) now and in 1 … F steps."""
+        first = min(self.first, path.shape[-2] - 1)
+        steps = torch.arange(first, path.shape[-2], self.stride, device=path.device)
+        places = path[..., first :: self.stride, :]
+        waited = places if self.early_steps == 0 else path[..., (steps - self.early_steps).clamp_min(0), :]
+        goals, gone = self.goals(waited), None if lost is None else lost.forecast(path)
         cost = self.waiting_cost * steps
         if self.base_pos is not None:
             x, y = self.base_pos
@@ -252,7 +250,7 @@ class ExactSearch:
         lost_there = None if gone is None else gone[..., first :: self.stride]
         if self.footprint == 0.0:
             return Candidates(steps, places, goals, steps, 1 - cost, None, lost_there)
-        before, dwell = self.dwells(whole, goals, first, gone)
+        before, dwell = self.dwells(path, goals, first, gone)
         return Candidates(steps, places, goals, steps - before, dwell - cost, dwell, lost_there)
 
     def goals(self, places: Tensor) -> Tensor:
@@ -261,12 +259,12 @@ class ExactSearch:
             if len(self.offset) != places.shape[-1]:
                 raise InputError(f"offset has {len(self.offset)} numbers, but places {places.shape[-1]} coordinates")
             places = places + places.new_tensor(self.offset)
-        level, height = places[..., :2], places[..., 2:]
+        level = places[..., :2]
         if self.half_extent is not None:
             level = level.clamp(-self.half_extent, self.half_extent)
-        if self.height is not None and height.shape[-1]:
+        if self.height is not None and places.shape[-1] > 2:
             return torch.nn.functional.pad(level, (0, 1), value=self.height)
-        return places if self.half_extent is None else torch.cat([level, height], dim=-1)
+        return places if self.half_extent is None else torch.cat([level, places[..., 2:]], dim=-1)
 
     def dwells(self, path: Tensor, goals: Tensor, first: int, gone: Tensor | None = None) -> tuple[Tensor, Tensor]:
         """How many steps before each candidate the target is at its place already, and how long it dwells in all.
@@ -283,15 +281,16 @@ class ExactSearch:
         """
         longest, level = self.longest_dwell, path[..., :2]
         if gone is not None:
-            level = torch.where(gone.unsqueeze(-1), torch.inf, level)
+            level = level.masked_fill(gone.unsqueeze(-1), torch.inf)
         level = torch.nn.functional.pad(level, (0, 0, longest, longest), value=torch.inf)
         # Windows around the candidates are views: nothing is copied before the difference.
         around = level[..., first:, :].unfold(-2, 2 * longest + 1, self.stride)
-        outside = ~((around - goals[..., :2].unsqueeze(-1)).abs().amax(-2) <= self.footprint)
-        number = torch.arange(1, longest + 2, device=path.device)
-        before = longest + 1 - (outside[..., : longest + 1] * number).amax(-1)
-        after = torch.where(outside[..., longest:], number, longest + 2).amin(-1) - 1
-        return (before - 1).clamp_min(0), (before + after - 1).clamp(0, longest)
+        inside = (around - goals[..., :2].unsqueeze(-1)).abs().amax(-2) <= self.footprint
+        number = torch.arange(longest + 1, device=path.device)
+        # Steps inside up to the candidate but for itself, -1 if it is not inside; and from it on.
+        before = longest - 1 - number.masked_fill(inside[..., : longest + 1], -1).amax(-1)
+        after = number.masked_fill(inside[..., longest:], longest + 1).amin(-1)
+        return before.clamp_min(0), (before + after).clamp(0, longest)
 
 
 def check_context(path: Tensor, target_pos: Tensor, context: SearchContext = NO_CONTEXT) -> None:

@@ -83,7 +83,8 @@ class SoftExactSearch:
         """
         check_context(forecast.path, target_pos, context)
         hard, heat = self.search, self.temperature
-        candidates = hard.candidates(forecast.path, target_pos, context.lost)
+        whole = torch.cat([target_pos.unsqueeze(-2), forecast.path], dim=-2)
+        candidates = hard.candidates(whole, context.lost)
         arrival = eta(candidates.goals, estimator="soft")
         target_steps = candidates.target_steps.to(forecast.path.dtype).expand(arrival.steps.shape)
         # A model that knows for certain may say never by infinite steps and a bool: finite numbers keep goals finite.
@@ -94,7 +95,6 @@ class SoftExactSearch:
         strict = LATENESS * (1.0 + 1.0 / heat)
         score = candidates.score
         if context.capture is not None:
-            whole = torch.cat([target_pos.unsqueeze(-2), forecast.path], dim=-2)
             captured = context.capture.probability(whole, candidates.goals, candidates.target_steps)
             score = score + hard.probability_weight * captured
         worth = self.point * score / heat + strict * (gate - _apart(candidates) / heat)
