@@ -47,7 +47,7 @@ VARIANTS: dict[str, dict[str, Any]] = {
     "without captures learned": {"capture": None, "search": waiting_search(SCENE)},
     "without shunning the arm's axis": {"search": replace(waiting_search(SCENE, by_capture=True), base_pos=None)},
     "first plan at step 13": {"schedule": ReplanSchedule.every(5, first_step=13)},
-    "with event-triggered re-planning": {"schedule": EventSchedule()},
+    "with event-triggered re-planning": {"schedule": EventSchedule(first_step=3)},
 }
 """Name to the parts that differ from the planner that ships, which comes first."""
 

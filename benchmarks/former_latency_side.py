@@ -32,6 +32,10 @@ CALLS = {
 """What is timed, in words."""
 
 
+NOISY = "wait_and_drop_noisy"
+"""*Wait and drop* with the networks trained with noise; where there are none yet, with those that there are."""
+
+
 def make_planner(name: str, static: str) -> Any:
     """Trapper's planner ``name``, as this checkout makes it."""
     try:
@@ -41,9 +45,25 @@ def make_planner(name: str, static: str) -> Any:
 
         planners: Any = torchdyn_plan.planners
 
-        kind = planners.MeetingPlanner if name == "wait_and_drop" else planners.DynamicPlanner
+        kind = planners.MeetingPlanner if name in ("wait_and_drop", NOISY) else planners.DynamicPlanner
         return kind.from_pretrained(f"trapper-{static}").eval()
-    return load_task("trapper").planner(name, static)
+    if name != NOISY:
+        return load_task("trapper").planner(name, static)
+    planner = load_task("trapper").planner("wait_and_drop", static)
+    both: Any = planner.forecaster
+    return planner.with_parts(forecaster=both.noisy)
+
+
+def tracked(step: TensorDict, planner: Any) -> TensorDict:
+    """What ``planner`` reads of ``step``: as long a history, and if it needs one, a track's covariance."""
+    forecaster: Any = getattr(planner, "forecaster", None)
+    if "target_covariance" not in getattr(forecaster, "in_keys", ()):
+        return step
+    history = step["target_history"]
+    missing = forecaster.history - history.shape[-2]
+    whole = torch.cat([history[:, :1].expand(-1, missing, -1), history], dim=1)
+    covariance = torch.tensor([[1e-6, 1e-6], [1e-6, 1e-3]]).expand(len(history), 2, 2)
+    return step.copy().update({"target_history": whole, "target_covariance": covariance})
 
 
 def for_inference(planner: Any) -> Any:
@@ -75,7 +95,7 @@ class Side:
     def prepare(self, planner: str, static: str, compiled: bool) -> dict[str, Any]:
         """Make the calls of a planner; returns their names and what the last plan and steps gave."""
         made = make_planner(planner, static)
-        before, after = self._play(made)
+        before, after = self._play(made, [tracked(step, made) for step in self.steps])
         at_rest = after.copy().set("goal", made(before.copy())["goal"])
         light = for_inference(made)
         plan, inputs = plan_call(made, before)
@@ -109,10 +129,10 @@ class Side:
             durations.append(1e6 * (time.perf_counter() - started))
         return durations
 
-    def _play(self, planner: Any) -> tuple[TensorDict, TensorDict]:
-        """What is seen, with the planner's memory, at its first plan and at the step after it."""
+    def _play(self, planner: Any, steps: Sequence[TensorDict]) -> tuple[TensorDict, TensorDict]:
+        """What of ``steps`` is seen, with the planner's memory, at its first plan and at the step after it."""
         memory = None
-        for step, after in zip(self.steps, self.steps[1:], strict=False):
+        for step, after in zip(steps, steps[1:], strict=False):
             before = _with_memory(step, memory)
             memory = planner(before.copy())["plan"]
             if memory["replanned"].all():

@@ -29,9 +29,9 @@ SCHEDULES: dict[str, ReplanSchedule | EventSchedule] = {
     "every 25": ReplanSchedule.every(25, first_step=3),
     "every 10": ReplanSchedule.every(10, first_step=3),
     "every 5": ReplanSchedule.every(5, first_step=3),
-    "events, up to 25": EventSchedule(maximum=25),
-    "events, up to 50": EventSchedule(maximum=50),
-    "events, up to 50, 1 mm": EventSchedule(maximum=50, miss=0.001),
+    "events, up to 25": EventSchedule(first_step=3, maximum=25),
+    "events, up to 50": EventSchedule(first_step=3, maximum=50),
+    "events, up to 50, 1 mm": EventSchedule(first_step=3, maximum=50, miss=0.001),
 }
 
 
