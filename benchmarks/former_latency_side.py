@@ -6,6 +6,7 @@ before tasks became folders (65afd9a), whose wait-and-drop planner was called `M
 
 from __future__ import annotations
 
+import itertools
 import json
 import os
 import sys
@@ -132,7 +133,7 @@ class Side:
     def _play(self, planner: Any, steps: Sequence[TensorDict]) -> tuple[TensorDict, TensorDict]:
         """What of ``steps`` is seen, with the planner's memory, at its first plan and at the step after it."""
         memory = None
-        for step, after in zip(steps, steps[1:], strict=False):
+        for step, after in itertools.pairwise(steps):
             before = _with_memory(step, memory)
             memory = planner(before.copy())["plan"]
             if memory["replanned"].all():
