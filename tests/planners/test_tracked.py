@@ -201,6 +201,13 @@ def test_the_history_is_as_long_as_the_forecaster_reads():
     assert tracked(planner).history == HISTORY
 
 
+def test_a_static_planner_with_a_variant_for_noise_is_exchanged_alone():
+    inner = DynamicPlanner.from_pretrained("trapper-ik")
+    seeing = TrackedPlanner(inner, KalmanTrack(noise=0.005), control_step=0.004).planner
+    assert seeing.static.damping == inner.static.noisy_damping
+    assert (seeing.forecaster, seeing.schedule) == (inner.forecaster, inner.schedule)
+
+
 def test_the_planner_that_ships_sees_noisy_targets_by_another_forecaster(tmp_path):
     """From the second measurement on; saved and loaded it is the same, and without noise it is the planner itself."""
     inner = DynamicPlanner.from_pretrained("trapper-ik-wait_and_drop")
@@ -209,6 +216,7 @@ def test_the_planner_that_ships_sees_noisy_targets_by_another_forecaster(tmp_pat
     assert exact.history == 24
     planner = TrackedPlanner(inner, KalmanTrack(noise=0.005), control_step=0.004)
     assert planner.planner.forecaster is inner.forecaster.noisy
+    assert planner.planner.static.damping > inner.static.damping
     assert planner.history == 48
     planner.save_pretrained(tmp_path)
     loaded = TrackedPlanner.from_pretrained(tmp_path)

@@ -27,6 +27,7 @@ from torchdyn_plan.planners.schedule import ReplanSchedule, Schedule, starting_a
 from torchdyn_plan.planners.search.corner import CornerSearch
 from torchdyn_plan.planners.search.exact import ExactSearch
 from torchdyn_plan.planners.search.meeting import GoalSearch
+from torchdyn_plan.planners.static.base import StaticPlannerModule
 from torchdyn_plan.planners.static.callable import TensorDictFunction
 from torchdyn_plan.planners.turn import Turn
 
@@ -154,16 +155,18 @@ class ComposedPlanner(PretrainedPlanner, Remembering):
     def for_noise(self, noise: float) -> Self:
         """The planner for targets tracked from measurements of standard deviation ``noise`` [m].
 
-        This is another planner if the forecaster has a variant for that noise; it then plans as soon as the target is
-        tracked well enough for it.
+        This is another planner if the forecaster or the static planner has a variant for that noise. With another
+        forecaster it plans as soon as the target is tracked well enough for it.
         """
-        forecaster = self.forecaster.for_noise(noise)
-        if forecaster is self.forecaster:
-            return self
-        schedule = self.schedule
-        if forecaster.samples is not None:
-            schedule = starting_at(schedule, forecaster.samples - 1)
-        return self.with_parts(forecaster=forecaster, schedule=schedule)
+        parts: dict[str, Any] = {}
+        forecaster, static = self.forecaster.for_noise(noise), self.static
+        if isinstance(static, StaticPlannerModule) and (steady := static.for_noise(noise)) is not static:
+            parts["static"] = steady
+        if forecaster is not self.forecaster:
+            parts["forecaster"] = forecaster
+            if forecaster.samples is not None:
+                parts["schedule"] = starting_at(self.schedule, forecaster.samples - 1)
+        return self.with_parts(**parts) if parts else self
 
     def part_settings(self) -> dict[str, Any]:
         """Constructor arguments of this planner."""

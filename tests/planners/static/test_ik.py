@@ -145,3 +145,18 @@ def test_memory_survives_resets_at_different_moments():
             expected = alone.rollout(len(part), planner)[0]
             for key in ("action", "goal", ("plan", "path_pos"), ("plan", "path_step"), ("next", "joint_pos")):
                 assert torch.equal(part[key], expected[key]), key
+
+
+def test_for_noisy_goals_it_has_another_damping():
+    planner = ik_planner(noisy_damping=0.3, gain=0.2).eval()
+    assert planner.for_noise(1e-4) is planner
+    steady = planner.for_noise(0.002)
+    assert steady.part_settings() == {
+        name: value for name, value in planner.part_settings().items() if name != "noisy_damping"
+    } | {"damping": 0.3}
+    assert steady.for_noise(0.002) is steady
+    assert not steady.training
+    without = ik_planner(noisy_damping=None)
+    assert without.for_noise(0.002) is without
+    with pytest.raises(InputError, match="noisy_damping must be"):
+        ik_planner(noisy_damping=-0.1)

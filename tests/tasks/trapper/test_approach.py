@@ -103,6 +103,23 @@ def test_an_arm_that_takes_itself_to_be_elsewhere_traps_less():
     assert trapped(OTHERS[0], planner) < 0.1
 
 
+def test_a_stretched_arm_keeps_its_height_when_noise_shakes_its_goal():
+    middle, draw = torch.tensor([0.0, 0.05, 0.105]), torch.Generator().manual_seed(0)
+    shakes = 0.006 * torch.randn(40, 8, 3, generator=draw) * torch.tensor([1.0, 1.0, 0.0])
+    off = []
+    for planner in (ik_planner(SCENE, chunk=32), ik_planner(SCENE, chunk=32).for_noise(0.002)):
+        env = TrapperEnv(8, velocity=1.0, seed=0, split="dev", num_threads=1)
+        td, heights = env.reset(), []
+        for shake in shakes:
+            td["goal"] = middle + shake
+            for _ in range(5):
+                td = env.step_and_maybe_reset(planner(td))[1]
+                heights.append(td["tool_pos"][:, 2])
+        off.append((torch.stack(heights[100:]) - middle[2]).abs().amax(0).mean())
+    assert off[0] > 0.03
+    assert off[1] < 0.4 * off[0], off
+
+
 def heading(goal, approach=APPROACH, at=None):
     """Twist of an upright, square box whose mouth is ``at`` (3,) [m, world], above ``goal`` (3,) by default."""
     place = (approach.within_reach(goal) if at is None else at) - torch.tensor(approach.base_pos)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import functools
 import math
 from collections.abc import Sequence
-from typing import Any, NamedTuple, cast
+from typing import Any, NamedTuple, Self, cast
 
 import torch
 from tensordict import TensorDictBase
@@ -21,6 +21,7 @@ from torchdyn_plan.kinematics.descent import evaluate
 from torchdyn_plan.kinematics.dls import braked_step, dls_step, limited_step
 from torchdyn_plan.kinematics.fused import Columns, Fused, filled
 from torchdyn_plan.nets.analytic_arrival import AnalyticArrival
+from torchdyn_plan.nets.by_noise import LEAST_NOISE
 from torchdyn_plan.planners.memory import remember, warn_of_loss
 from torchdyn_plan.planners.protocol import read
 from torchdyn_plan.planners.static.approach import Approach, StraightToGoal, is_round, reads_pose
@@ -78,6 +79,7 @@ class IKPlanner(Precise, StaticPlannerModule):
         approach: Approach | None = None,
         control_step: float = 0.004,
         damping: float = 0.02,
+        noisy_damping: float | None = None,
         gain: float = 0.25,
         acceleration: float | Sequence[float] | None = None,
         chunk: int | None = None,
@@ -90,6 +92,9 @@ class IKPlanner(Precise, StaticPlannerModule):
             approach: how the tool approaches a goal; straight, from a base at the world's origin, by default.
             control_step: time between two actions [s].
             damping: λ of the least squares.
+            noisy_damping: λ for goals from noisy measurements, see `for_noise`. None for ``damping``. An arm that is
+                nearly stretched out shakes when its goal jitters: joints reverse at full speed, not all in the same
+                time, and the tool leaves its height by centimetres. More damping keeps it still.
             gain: share of the remaining joint error that one step may cover, which brakes the arm at the end.
             acceleration: limit of each joint, or of all of them [rad/s²]. The arm then brakes by this limit instead of
                 ``gain``, and follows a moving goal one control step behind it. None for the gain only.
@@ -105,6 +110,8 @@ class IKPlanner(Precise, StaticPlannerModule):
             raise InputError(f"arm must be an Arm, such as Arm.ur5() or Arm.from_urdf(...), got {type(arm).__name__}")
         if chunk is not None:
             check_number("chunk", chunk, minimum=1, integer=True)
+        if noisy_damping is not None:
+            check_number("noisy_damping", noisy_damping, minimum=1e-9)
         self.arm, self.approach = arm, approach or StraightToGoal()
         turns = reads_pose(self.approach)
         self._round = is_round(self.approach)
@@ -115,7 +122,7 @@ class IKPlanner(Precise, StaticPlannerModule):
         self.in_keys = [keys.JOINT_POS, self.goal_key, keys.STEP_COUNT, *remembered]
         self.out_keys = [keys.ACTION, *remembered]
         self.control_step, self.damping, self.gain, self.chunk = control_step, damping, gain, chunk
-        self.compiled = compiled
+        self.noisy_damping, self.compiled = noisy_damping, compiled
         self._fused = Fused(self._fused_step) if compiled else None
         self._width = torch.Size([arm.num_joints])
         self.register_buffer("_limit", arm.needed_speed_limit("IKPlanner") * control_step, False)
@@ -171,9 +178,16 @@ class IKPlanner(Precise, StaticPlannerModule):
     def part_settings(self) -> dict[str, Any]:
         """Constructor arguments of this planner."""
         names = ("arm", "approach", "control_step", "damping", "gain", "chunk", "compiled")
-        # Left out if absent, so that planners saved before this setting existed keep their description.
-        others = () if self.acceleration is None else ("acceleration",)
+        # Left out if absent, so that planners saved before these settings existed keep their description.
+        others = [name for name in ("noisy_damping", "acceleration") if getattr(self, name) is not None]
         return {name: getattr(self, name) for name in (*names, *others)}
+
+    def for_noise(self, noise: float) -> Self:
+        """The planner with ``noisy_damping``, if it has one and measurements err by `LEAST_NOISE` or more [m]."""
+        if self.noisy_damping is None or noise < LEAST_NOISE:
+            return self
+        settings: dict[str, Any] = self.part_settings() | {"damping": self.noisy_damping, "noisy_damping": None}
+        return type(self)(**settings).train(self.training)
 
     def _brake_of(self, acceleration: float | Sequence[float]) -> Tensor:
         """Largest change of each joint's step from one control step to the next, ``(N,)`` [rad]."""

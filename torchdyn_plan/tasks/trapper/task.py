@@ -77,7 +77,8 @@ def ik_planner(scene: Any = None, *, chunk: int | None = None, weights: Any = No
 
     scene = trapper_scene(scene)
     arm = Arm.ur5(tool_length=scene.tool_length, speed_limit=scene.joint_speed)
-    return IKPlanner(arm, approach=BoxApproach.of(scene), control_step=scene.control_step, chunk=chunk, **settings)
+    own = {"noisy_damping": 0.1, "control_step": scene.control_step, "chunk": chunk}
+    return IKPlanner(arm, approach=BoxApproach.of(scene), **(own | settings))
 
 
 def policy_planner(scene: Any = None, *, chunk: int | None = None, weights: Any = None, **settings: Any) -> Any:
