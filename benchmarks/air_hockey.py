@@ -12,9 +12,6 @@ from __future__ import annotations
 
 import base64
 import gc
-import json
-import os
-import subprocess
 import time
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
@@ -28,9 +25,9 @@ import tyro
 from air_hockey_agent import Agent
 from air_hockey_defend import Defender
 from air_hockey_hit import Hitter
+from sides import Answering
 from study import Output, Row, Study, each, measuring, rate_entries, told
 
-HERE = Path(__file__).parent
 LIMIT = 20.0
 """An action may take so long [ms]."""
 SIZE = 360, 270
@@ -59,35 +56,14 @@ class Arguments(Output):
     """WebP of our first episodes, drawn in place of a measurement; the challenge's machine needs OpenGL."""
 
 
-class Challenge:
-    """One of the challenge's tasks, in a process of its own that answers line by line."""
+class Challenge(Answering):
+    """One of the challenge's tasks, in a process of its own, ready for calls of its `Side`."""
 
     def __init__(self, task: str, arguments: Arguments) -> None:
         """Start it."""
         more = [] if arguments.repository is None else [str(arguments.repository.resolve())]
-        command = [str(arguments.python), str(HERE / "air_hockey_side.py"), task, *more]
-        env = {name: value for name, value in os.environ.items() if name != "PYTHONPATH"} | {"OMP_NUM_THREADS": "1"}
-        self.process = subprocess.Popen(command, env=env, text=True, stdin=subprocess.PIPE, stdout=subprocess.PIPE)
-        self.about = self._answer()
-
-    def ask(self, name: str, *arguments: Any) -> Any:
-        """Call a method of its `Side`."""
-        assert self.process.stdin
-        print(json.dumps([name, arguments]), file=self.process.stdin, flush=True)
-        return self._answer()
-
-    def close(self) -> None:
-        """Let the process end."""
-        assert self.process.stdin
-        self.process.stdin.close()
-        self.process.wait()
-
-    def _answer(self) -> Any:
-        assert self.process.stdout
-        line = self.process.stdout.readline()
-        if not line:
-            raise SystemExit("the challenge's process ended; what it said stands above")
-        return json.loads(line)
+        super().__init__(arguments.python, "air_hockey_side.py", task, *more, package=None)
+        self.about = self.answer()
 
 
 def agent_of(task: str, challenge: Challenge) -> Agent:
@@ -116,7 +92,7 @@ def play(
     each_step: Callable[[int], None] = lambda step: None,
 ) -> Row:
     """One episode of ours, as `Side.baseline` tells of the baseline's; ``each_step`` is called before each."""
-    seen = challenge.ask("reset", series, episode)
+    seen = challenge.call("reset", series, episode)
     agent.start()
     milliseconds: list[list[float]] = []
     violated: set[str] = set()
@@ -127,7 +103,7 @@ def play(
             action = agent.act(seen)
             taken = time.perf_counter() - begun[0], time.process_time() - begun[1]
             milliseconds.append([1e3 * seconds for seconds in taken])
-            seen = challenge.ask("step", *action)
+            seen = challenge.call("step", *action)
             violated.update(seen["violated"])
             if seen["over"]:
                 return {"success": seen["success"], "violated": sorted(violated), "milliseconds": milliseconds}
@@ -141,7 +117,7 @@ def draw(challenge: Challenge, agent: Agent, arguments: Arguments, *, episodes: 
     frames: list[Image.Image] = []
 
     def frame() -> None:
-        picture = base64.b64decode(challenge.ask("picture", *SIZE))
+        picture = base64.b64decode(challenge.call("picture", *SIZE))
         frames.append(Image.frombytes("RGB", SIZE, picture))
 
     for episode in range(episodes):
@@ -158,7 +134,7 @@ def measure(challenge: Challenge, agent: Agent | None, series: str, first: int, 
     played = []
     for episode in range(first, first + count):
         if agent is None:
-            played.append(challenge.ask("baseline", series, episode))
+            played.append(challenge.call("baseline", series, episode))
         else:
             played.append(play(challenge, agent, series, episode))
     times = np.concatenate([row["milliseconds"] for row in played])

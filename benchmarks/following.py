@@ -165,7 +165,7 @@ def main(arguments: Arguments) -> None:
             asked = sides if how == "solve_ik" else {"now": sides["now"]}
             study.add({"arm": name, "how": how, **in_turn(asked, f"{name}|{how}", arguments.repeats)})
     for side in sides.values():
-        side.end()
+        side.close()
 
 
 if __name__ == "__main__":

@@ -10,10 +10,7 @@ blocks, of this checkout's median divided by the other's.
 
 from __future__ import annotations
 
-import json
-import os
 import statistics
-import subprocess
 import sys
 import tempfile
 from collections.abc import Iterator
@@ -25,12 +22,12 @@ import torch
 import tyro
 from former_latency_side import CALLS
 from safetensors.torch import save_file
+from sides import HERE, Answering
 from study import Output, Row, Study, each, measuring
 
 from torchdyn_plan import keys
 from torchdyn_plan.tasks import load_task
 
-HERE = Path(__file__).parent
 SEEN = (
     keys.JOINT_POS,
     keys.JOINT_VEL,
@@ -65,36 +62,13 @@ class Arguments(Output):
     """Length of a block."""
 
 
-class Checkout:
-    """A checkout in a process of its own that answers line by line."""
-
-    def __init__(self, root: Path, observations: Path) -> None:
-        """Start the package in ``root``."""
-        env = os.environ | {"PYTHONPATH": str(root), "OMP_NUM_THREADS": "1"}
-        command = [sys.executable, str(HERE / "former_latency_side.py"), str(observations)]
-        self.process = subprocess.Popen(command, env=env, text=True, stdin=subprocess.PIPE, stdout=subprocess.PIPE)
-        package = Path(self._answer())
-        if not package.is_relative_to(root):
-            raise SystemExit(f"{root} was to be timed, but Python took {package}")
-
-    def ask(self, name: str, *arguments: Any) -> Any:
-        """Call a method of its `Side`."""
-        assert self.process.stdin
-        print(json.dumps([name, arguments]), file=self.process.stdin, flush=True)
-        return self._answer()
-
-    def close(self) -> None:
-        """Let the process end."""
-        assert self.process.stdin
-        self.process.stdin.close()
-        self.process.wait()
-
-    def _answer(self) -> Any:
-        assert self.process.stdout
-        line = self.process.stdout.readline()
-        if not line:
-            raise SystemExit("a checkout's process ended; what it said stands above")
-        return json.loads(line)
+def checkout_in(root: Path, observations: Path) -> Answering:
+    """The checkout in ``root``, in a process of its own, ready for calls of its `Side`."""
+    checkout = Answering(sys.executable, "former_latency_side.py", str(observations), package=root)
+    package = Path(checkout.answer())
+    if not package.is_relative_to(root):
+        raise SystemExit(f"{root} was to be timed, but Python took {package}")
+    return checkout
 
 
 def record(file: Path) -> None:
@@ -115,14 +89,14 @@ def compare(observations: Path, planner: str, static: str, arguments: Arguments)
     blocks: dict[str, list[tuple[float, float]]] = {call: [] for call in arguments.calls}
     same: dict[str, bool] = {}
     for _ in each(range(arguments.processes), f"{planner}, {static}"):
-        here, there = (Checkout(root.resolve(), observations) for root in (HERE.parent, arguments.former))
-        prepared = [side.ask("prepare", planner, static, "plan_compiled" in arguments.calls) for side in (here, there)]
+        here, there = (checkout_in(root.resolve(), observations) for root in (HERE.parent, arguments.former))
+        prepared = [side.call("prepare", planner, static, "plan_compiled" in arguments.calls) for side in (here, there)]
         for name in ("plans", "actions"):
             same[f"same_{name}"] = same.get(f"same_{name}", True) and prepared[0][name] == prepared[1][name]
         for call in arguments.calls:
             for number in range(arguments.rounds):
                 sides = (here, there) if number % 2 == 0 else (there, here)
-                medians = {side: statistics.median(side.ask("time", call, arguments.seconds)) for side in sides}
+                medians = {side: statistics.median(side.call("time", call, arguments.seconds)) for side in sides}
                 blocks[call].append((medians[here], medians[there]))
         here.close()
         there.close()

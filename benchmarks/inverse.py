@@ -75,7 +75,7 @@ def main(arguments: Arguments) -> None:
     for name in each(arguments.arms, "arms"):
         study.add({"arm": name, **in_turn(sides, name, arguments.repeats)})
     for side in sides.values():
-        side.end()
+        side.close()
 
 
 if __name__ == "__main__":

@@ -68,7 +68,7 @@ def main(arguments: Arguments) -> None:
         figures = {key: row[what] for key, row in least.items() if what in row}
         study.add({"what": problem, "implementation": implementation, "now": median, **figures})
     for side in sides.values():
-        side.end()
+        side.close()
 
 
 if __name__ == "__main__":

@@ -149,7 +149,7 @@ def main(arguments: Arguments) -> None:
             asked = {"now": sides["now"]} if "solutions" in options else sides
             study.add({"case": case, "how": how, **in_turn(asked, f"{case}|{how}", arguments.repeats)})
     for side in sides.values():
-        side.end()
+        side.close()
     with measuring():
         study.add({"case": "all solutions [µs a pose]", **speed(arguments.poses, arguments.seconds)})
 

@@ -9,6 +9,7 @@ import sys
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 from study import Output, Row, measuring
 
@@ -27,28 +28,48 @@ class Compared(Output):
     """Serve as one side: lines come in, a line of JSON for each goes out."""
 
 
-class Side:
+class Answering:
+    """A process, on one thread, that answers each line it reads with a line of JSON."""
+
+    def __init__(self, python: Path | str, script: str, *words: str, package: Path | None) -> None:
+        """Start ``script`` of this folder with this ``python`` and the package in that folder, or none."""
+        env = {name: value for name, value in os.environ.items() if name != "PYTHONPATH"} | {"OMP_NUM_THREADS": "1"}
+        if package is not None:
+            env["PYTHONPATH"] = str(package)
+        self.script, command = script, [str(python), str(HERE / script), *words]
+        self.process = subprocess.Popen(command, env=env, text=True, stdin=subprocess.PIPE, stdout=subprocess.PIPE)
+
+    def ask(self, line: str) -> Any:
+        """What it answers to ``line``."""
+        assert self.process.stdin
+        print(line, file=self.process.stdin, flush=True)
+        return self.answer()
+
+    def call(self, name: str, *arguments: Any) -> Any:
+        """What it answers to the name of a method and its arguments."""
+        return self.ask(json.dumps([name, arguments]))
+
+    def answer(self) -> Any:
+        """What it says next."""
+        assert self.process.stdout
+        line = self.process.stdout.readline()
+        if not line:
+            raise SystemExit(f"{self.script} ended in its process; what it said stands above")
+        return json.loads(line)
+
+    def close(self) -> None:
+        """Let it end."""
+        assert self.process.stdin
+        self.process.stdin.close()
+        self.process.wait()
+
+
+class Side(Answering):
     """A process that runs a script of this folder with one checkout's package."""
 
     def __init__(self, script: str, checkout: Path, *words: str) -> None:
         """Start it, as one side, with more ``words`` of arguments."""
-        env = {**os.environ, "PYTHONPATH": str(checkout), "OMP_NUM_THREADS": "1"}
-        command = [sys.executable, str(HERE / script), "--side", *words]
-        self.process = subprocess.Popen(command, env=env, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True)
-
-    def ask(self, line: str) -> Row:
-        """What it answers."""
-        assert self.process.stdin is not None
-        assert self.process.stdout is not None
-        self.process.stdin.write(f"{line}\n")
-        self.process.stdin.flush()
-        return json.loads(self.process.stdout.readline())
-
-    def end(self) -> None:
-        """Stop it."""
-        assert self.process.stdin is not None
-        self.process.stdin.close()
-        self.process.wait()
+        super().__init__(sys.executable, script, "--side", *words, package=checkout)
 
 
 def serve(answer: Callable[[str], Row]) -> None:
