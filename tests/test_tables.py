@@ -96,6 +96,15 @@ def test_sensors_in_the_readme():
         agree(printed, [100 * row["success_solvable"] for row in rows], first)
 
 
+def test_sensors():
+    rows, sensor = rows_of("sensors.json"), ""
+    for first, (velocity, *printed) in table("docs/sensors.md", "sensor | m/s"):
+        sensor = first or sensor
+        of = {row["planner"]: row for row in rows if (row["sensor"], row["velocity"]) == (sensor, float(velocity))}
+        planners = ("wait_and_drop", "exact_forecast", "billiard", "constant_velocity")
+        agree(printed, [of[name]["success_solvable"] for name in planners if name in of], (sensor, velocity))
+
+
 def test_trainings_with_noise():
     rows = [row for row in rows_of("trainings_noisy.json") if "over" in row and "velocity" in row]
     for first, printed in table("docs/sensors.md", "five trainings"):
