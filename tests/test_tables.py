@@ -183,6 +183,22 @@ def test_schedules():
         agree(printed, [100 * three["success_solvable"], 100 * five["success_solvable"], *both], first)
 
 
+def test_being_late():
+    rows = rows_of("latency/results.json")
+    for first, printed in table("docs/latency.md", "planning takes"):
+        delay, compensated = int(first.split()[0]), "not" not in first
+        expected = []
+        for velocity in (3.0, 5.0):
+            (row,) = (
+                row
+                for row in rows
+                if (row["velocity"], row["latency_ms"], row["compensate"]) == (velocity, delay, compensated)
+            )
+            expected += [100 * row["success_solvable"]]
+            expected += [100 * one for one in (row["change"], *row["change_ci"])] if delay else []
+        agree(printed, expected, first)
+
+
 def test_fetch_reach():
     sweep, policy = rows_of("reach/results.json"), rows_of("reach/policy/results.json")
     lines = dict(table("docs/results.md", "metres a step"))
