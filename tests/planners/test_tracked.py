@@ -14,6 +14,7 @@ from torchdyn_plan.planners import (
     DynamicPlanner,
     KalmanTrack,
     PlanStatus,
+    PointPlanner,
     ReplanSchedule,
     TargetPursuit,
     TrackedPlanner,
@@ -206,6 +207,17 @@ def test_a_static_planner_with_a_variant_for_noise_is_exchanged_alone():
     seeing = TrackedPlanner(inner, KalmanTrack(noise=0.005), control_step=0.004).planner
     assert seeing.static.damping == inner.static.noisy_damping
     assert (seeing.forecaster, seeing.schedule) == (inner.forecaster, inner.schedule)
+
+
+def test_a_persons_own_static_planner_may_have_a_variant_for_noise():
+    class Hasty(PointPlanner):
+        def for_noise(self, noise):
+            return self if noise < 0.01 else slow
+
+    limits = {"acceleration": 1.0, "control_step": STEP}
+    slow, planner = PointPlanner(speed=0.1, **limits), DynamicPlanner(Hasty(speed=1.0, **limits))
+    assert planner.for_noise(0.001) is planner
+    assert planner.for_noise(0.02).static is slow
 
 
 def test_the_planner_that_ships_sees_noisy_targets_by_another_forecaster(tmp_path):

@@ -27,7 +27,6 @@ from torchdyn_plan.planners.schedule import ReplanSchedule, Schedule, starting_a
 from torchdyn_plan.planners.search.corner import CornerSearch
 from torchdyn_plan.planners.search.exact import ExactSearch
 from torchdyn_plan.planners.search.meeting import GoalSearch
-from torchdyn_plan.planners.static.base import StaticPlannerModule
 from torchdyn_plan.planners.static.callable import TensorDictFunction
 from torchdyn_plan.planners.turn import Turn
 
@@ -155,12 +154,12 @@ class ComposedPlanner(PretrainedPlanner, Remembering):
     def for_noise(self, noise: float) -> Self:
         """The planner for targets tracked from measurements of standard deviation ``noise`` [m].
 
-        This is another planner if the forecaster or the static planner has a variant for that noise. With another
-        forecaster it plans as soon as the target is tracked well enough for it.
+        This is another planner if the forecaster, or the static planner by a method ``for_noise``, has a variant for
+        that noise. With another forecaster it plans as soon as the target is tracked well enough for it.
         """
         parts: dict[str, Any] = {}
-        forecaster, static = self.forecaster.for_noise(noise), self.static
-        if isinstance(static, StaticPlannerModule) and (steady := static.for_noise(noise)) is not static:
+        forecaster, variant = self.forecaster.for_noise(noise), getattr(self.static, "for_noise", None)
+        if variant is not None and (steady := variant(noise)) is not self.static:
             parts["static"] = steady
         if forecaster is not self.forecaster:
             parts["forecaster"] = forecaster

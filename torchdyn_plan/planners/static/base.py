@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import ClassVar, Self
+from typing import ClassVar
 
 from torchdyn_plan.planners.memory import Remembering
 
@@ -12,7 +12,3 @@ class StaticPlannerModule(Remembering):
 
     comes_to_rest: ClassVar[bool] = True
     """Whether the robot comes to rest where it cannot get nearer to its goal."""
-
-    def for_noise(self, noise: float) -> Self:
-        """The planner for goals derived from measurements of standard deviation ``noise`` [m]; the same by default."""
-        return self
